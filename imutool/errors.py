@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from functools import partial
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -64,7 +65,12 @@ class ImutoolError(Exception):
 
     def at(self, where: object) -> ImutoolError:
         """Error with its place filled in, by a caller that has the name of the file."""
-        return self if self.where is not None else type(self)(self.what, where=where, expected=self.expected, fix=self.fix)
+        return self if self.where is not None else self.replaced(where=where)
+
+    def replaced(self, **parts: Any) -> ImutoolError:
+        """Error of the same class with some parts replaced."""
+        own = {"what": self.what, "where": self.where, "expected": self.expected, "fix": self.fix}
+        return type(self)(**{**own, **parts})
 
     def renamed(self, names: Mapping[str, str]) -> ImutoolError:
         """Error with other names of places in its text, such as that of a file whose temporary one it is about."""
@@ -76,11 +82,7 @@ class ImutoolError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle with keyword arguments: errors of worker processes return to the parent."""
-        return _rebuild, (type(self), self.what, self.where, self.expected, self.fix)
-
-
-def _rebuild(kind: type[ImutoolError], what: str, where: str | None, expected: str, fix: str) -> ImutoolError:
-    return kind(what, where=where, expected=expected, fix=fix)
+        return partial(type(self), self.what, where=self.where, expected=self.expected, fix=self.fix), ()
 
 
 class ConfigError(ImutoolError):

@@ -307,7 +307,7 @@ def test_the_command_in_place_and_what_contradicts_it(
 ) -> None:
     before = source.read_bytes()
     for words, said in (
-        ([], "no OUT; expected a name for the new log. Give OUT, or --in-place"),
+        ([], "OUT is missing; expected a name for the new log. Give OUT, or --in-place"),
         (["x.mcap", "--in-place"], "--in-place and x.mcap"),
         (["--in-place", "--overwrite"], "--in-place and --overwrite"),
         (["x.mcap", "--verify", "some"], "'some'; expected all, imu, none"),

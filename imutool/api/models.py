@@ -222,9 +222,9 @@ def _log_to_debias(
     """Log, target and model, checked before any work."""
     place = location(source)
     if isinstance(model, BiasModel) or isinstance(target, BiasModel):
-        raise ConfigError("a loaded model", where="model", expected="a model file, whose digest goes into the log")
+        raise ConfigError("this is a loaded model", where="model", expected="a model file, whose digest goes into the log")
     if in_place == (target is not None):
-        raise ConfigError("`target` and `in_place`", where="debias", expected="one of the two")
+        raise ConfigError("neither or both of `target` and `in_place` are given", where="debias", expected="one of the two")
     out, given = None if target is None else location(target), list(model.values()) if isinstance(model, Mapping) else model
     check_outputs([OutputFile("target", out, output_conflicts.LOG)], [place, given], overwrite=overwrite)
     return place, out, model
@@ -239,7 +239,9 @@ def _refuse(options: Mapping[str, object]) -> None:
 
 def _debias_recording(recording: Recording, model: object, init: str, smooth: bool, force: bool) -> DebiasedRecording:
     if not isinstance(model, Model | None):
-        raise ConfigError(f"{type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model")
+        raise ConfigError(
+            f"of type {type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model"
+        )
     recording.imu.check_rate(recording.name)
     about = recording.metadata.get("imutool", {})
     if DEBIASED_BY in about and not force:

@@ -237,7 +237,7 @@ class LiveView:
 
     @property
     def outputs(self) -> list[Output]:
-        """Where the samples were shown."""
+        """Viewers and files that showed the samples."""
         return self._show.shown
 
 

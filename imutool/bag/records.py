@@ -95,7 +95,7 @@ class Loss:
 
 
 class Message(NamedTuple):
-    """Where one message lies in the bytes of its chunk."""
+    """Place of one message in the bytes of its chunk."""
 
     connection: int
     time_ns: int

@@ -23,7 +23,7 @@ PASSES = 3  # to plan, to write, to check
 
 @dataclass(frozen=True)
 class BagReport:
-    """What a repaired bag holds, and what of the source it does not."""
+    """Contents of a repaired bag, and what is missing from it."""
 
     messages: Mapping[str, int]  # per topic
     chunks: int
@@ -163,7 +163,7 @@ def _length(chunk: Chunk) -> int:
 
 
 def _offsets(chunk: Chunk) -> list[int]:
-    """Where each message begins in the chunk's bytes as they are written."""
+    """Start of each message in the chunk's bytes as they are written."""
     if chunk.whole:
         return [message.at for message in chunk.messages]
     offsets, at = [], 0

@@ -212,7 +212,7 @@ def _gyro_against_poses(
 
 
 def _nearest(choice: Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:
-    """Of the readings that fit about as well as the best, the one nearest to the log's axes; it is no proposal."""
+    """The reading nearest to the log's axes among those that fit about as well as the best; it is no proposal."""
     close = choice.misfit < choice.misfit.min() / CLEARLY
     good = [row for row in np.flatnonzero(close).tolist() if readings[row][0] == readings[choice.best][0]]
     nearest = max(good, key=lambda row: float(np.trace(readings[row][1])), default=choice.best)

@@ -55,7 +55,7 @@ class Stamps(NamedTuple):
 
     @property
     def faults(self) -> list[str]:
-        """What is wrong, in words."""
+        """Faults, in words."""
         if self.unset:
             return [f"the stamps are not set: each is {self.stamp_ns[0]} ns"]
         words = [f"the stamps' fractions of a second are written in {self.fraction}, not in ns"] if self.fraction else []

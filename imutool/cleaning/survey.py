@@ -235,13 +235,20 @@ def _through(
     The second value is the topic's totals.
     """
     stages = dict(sorted(rules.items(), key=lambda item: item[1].place))
-    motion, counter = Motion(), _Counter()
-    stream: Iterable[Samples] = counter(blocks(batches))
+    motion, messages = Motion(), 0
+
+    def received() -> Iterator[Samples]:
+        nonlocal messages
+        for samples in blocks(batches):
+            messages += len(samples.number)
+            yield samples
+
+    stream: Iterable[Samples] = received()
     for stage in stages.values():
         stream = stage(stream)
     for samples in stream:
         motion.see(samples)
-    return stages, TopicSummary(settings, counter.count, motion, truth)
+    return stages, TopicSummary(settings, messages, motion, truth)
 
 
 @cache
@@ -250,18 +257,6 @@ def _rule(name: str) -> type[Rule]:
     module = registry.load(GROUP, name)
     own = (value for value in vars(module).values() if isinstance(value, type) and value.__module__ == module.__name__)
     return next(cls for cls in own if issubclass(cls, Rule))
-
-
-class _Counter:
-    """Counts the messages before any rule sees them."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
-        for samples in stream:
-            self.count += len(samples.number)
-            yield samples
 
 
 def raw_batches(log: Log, topic: str, end_ns: int | None = None) -> Iterator[ImuBatch]:

@@ -29,7 +29,6 @@ from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.report import Report
 
-REPORT_HEAD = 200  # bytes of a JSON report that hold its schema
 PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
 NOTHING_LEFT = "Nothing half-written is left"
 
@@ -147,7 +146,7 @@ class Command(TyperCommand):
 
 def _is_report(place: str | Path | None) -> bool:
     """Whether a file is a JSON report of imutool."""
-    return b'"schema": "imutool.' in first_bytes(Path(place or ""), REPORT_HEAD)
+    return b'"schema": "imutool.' in first_bytes(Path(place or ""), 200)  # the schema comes first
 
 
 class App(typer.Typer):
@@ -218,6 +217,7 @@ ReportPage = Annotated[
     Path | None, typer.Option(metavar="F.html", help="Write an HTML page with figures, paths, errors and spectra."), HTML
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="key=value", help="Change one setting. Repeatable.")]
 MaxChunk = Annotated[
     int | None, typer.Option(min=1, metavar="BYTES", help="Largest chunk to unpack into memory (default: 268435456).")
 ]

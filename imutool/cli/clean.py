@@ -117,16 +117,11 @@ def show(survey: Survey) -> None:
     line = f"{plain(survey.topic)}: [bold {color}]{survey.verdict}[/], score {survey.score:.3f}, {counts}"
     out.print(line, highlight=False, soft_wrap=True)
     if survey.findings:
-        table(finding_rows(survey), keys=1)
+        head = "rule", "count", "what was found", "done", "when s"
+        found = [(one.rule, str(one.count), one.what, one.action, one.when(survey.start_ns)) for one in survey.findings]
+        table([head, *found], keys=1)
     for reason in survey.reasons:
         say(reason, "not to be trusted", "red")
-
-
-def finding_rows(survey: Survey) -> list[tuple[str, ...]]:
-    """Rows of the table of findings, the header first."""
-    head = "rule", "count", "what was found", "done", "when s"
-    rows = ((one.rule, str(one.count), one.what, one.action, one.when(survey.start_ns)) for one in survey.findings)
-    return [head, *rows]
 
 
 REPAIRED = Written((".mcap", ".bag"))
@@ -156,9 +151,7 @@ class Repair(Report, frozen=True, kw_only=True, tag="imutool.repair/1"):
 def repair(
     source: Annotated[str, typer.Argument(metavar="IN", help="A damaged MCAP log or ROS 1 bag: a file or a URL.")],
     target: Annotated[str, typer.Argument(metavar="OUT", help="New log with all intact messages."), REPAIRED],
-    damaged: Annotated[
-        Damaged, typer.Option(help="Damaged stretches: drop them, or keep their bytes as attachments (MCAP).")
-    ] = Damaged.drop,
+    damaged: Annotated[Damaged, typer.Option(help="Drop damaged bytes, or keep them as attachments (MCAP).")] = Damaged.drop,
     max_chunk: MaxChunk = None,
     common: Common = COMMON,
 ) -> None:

@@ -177,7 +177,9 @@ def export(
 @app.command(epilog="Example: [bold]imutool new-converter my_logger[/]")
 def new_converter(
     name: Annotated[str, typer.Argument(help="Name on the command line, such as my_logger.")],
-    folder: Annotated[Path | None, typer.Option("-o", "--folder", help="New folder; by default imutool-NAME.")] = None,
+    folder: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="New folder; by default imutool-NAME.")
+    ] = None,
 ) -> None:
     """Write a template of a converter, with a test, as a package of its own."""
     from imutool.conversion.converter_template import write_template

@@ -216,12 +216,16 @@ def _draw(log: Location, fits: Mapping[str, Fitness], page: Path, overwrite: boo
 
 def _refuse_contradictions(target: str | None, in_place: bool, overwrite: bool) -> None:
     if in_place and target is not None:
-        raise ConfigError(f"--in-place and {target}", where="--in-place", fix="Leave one of the two out")
+        raise ConfigError(f"--in-place and {target} exclude each other", where="--in-place", fix="Leave one of the two out")
     if in_place and overwrite:
-        raise ConfigError("--in-place and --overwrite", where="--in-place", fix="Leave --overwrite out: IN alone is replaced")
+        raise ConfigError(
+            "--in-place and --overwrite exclude each other",
+            where="--in-place",
+            fix="Leave --overwrite out: IN alone is replaced",
+        )
     if target is None and not in_place:
         raise ConfigError(
-            "no OUT", where="debias", expected="a name for the new log", fix="Give OUT, or --in-place to replace IN"
+            "OUT is missing", where="debias", expected="a name for the new log", fix="Give OUT, or --in-place to replace IN"
         )
 
 
@@ -239,9 +243,11 @@ def assigned(words: Sequence[str]) -> dict[str, str]:
         if not sign or Path(word).exists():
             topic, name = "", word
         elif not topic or not name:
-            raise ConfigError(f"{word!r}", where="--model", expected="MODEL or TOPIC=MODEL")
+            raise ConfigError(f"{word!r} has nothing on one side of =", where="--model", expected="MODEL or TOPIC=MODEL")
         if topic in models:
             whom = topic or "all IMUs"
-            raise ConfigError(f"{models[topic]} and {name} for {whom}", where="--model", expected="one model for each IMU")
+            raise ConfigError(
+                f"{models[topic]} and {name} are both given for {whom}", where="--model", expected="one model for each IMU"
+            )
         models[topic] = name
     return models

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import typer
@@ -20,7 +19,6 @@ from imutool.report import Report
 if TYPE_CHECKING:
     from imutool.recording import Recording
     from imutool.training.fit import Epoch
-    from imutool.training.settings import TrainSettings
 
 FOLDER = Written(files=("*",), keeps=True)
 
@@ -57,38 +55,20 @@ def demo(
 
     with common.progress("Training") as tell:
         done = run(folder, announce, overwrite=common.overwrite, progress=lambda epoch: tell(*epoch_line(epoch)))
-    files = {name: str(getattr(done, name)) for name in ("log", "debiased", "model", "rrd", "png", "report")}
-    if not common.write(DemoReport(results=msgspec.convert(done.results, list[Score]), **files)):
+    if not common.write(done):
         say("Pure integration of a flight the model has not seen, from its true start:")
-        figures(done.results)
+        figures(msgspec.to_builtins(done.results))
         say(f"Report: {done.report}. Error curves: {done.png}. In the viewer: rerun {done.rrd}")
-
-
-@dataclass(frozen=True)
-class Demo:
-    """Files of the demo, and its scores."""
-
-    log: Path
-    debiased: Path
-    model: Path
-    rrd: Path
-    png: Path
-    report: Path
-    results: list[dict[str, Any]]
 
 
 def run(
     out: Path,
-    say: Callable[[str], None] = print,
+    say: Callable[[str], None],
     *,
     overwrite: bool = False,
     progress: Callable[[Epoch], None] | None = None,
-    seed: int = TEST_SEED,
-    settings: TrainSettings | None = None,
-) -> Demo:
+) -> DemoReport:
     """Run every step in the folder `out`, and report each.
-
-    `seed` is the seed of the flight that tests the model.
 
     Raises:
         ConfigError: the folder holds an earlier demo, or the extras view and report are not installed.
@@ -104,28 +84,27 @@ def run(
     from imutool.viewing.rerun import scene
 
     raw, logs = out / "raw", out / "logs"
-    names = [f"flight_{number}" for number in (*TRAINING_SEEDS, seed)]
+    names = [f"flight_{number}" for number in (*TRAINING_SEEDS, TEST_SEED)]
     log, model, debiased = logs / f"{names[-1]}.mcap", out / "model.safetensors", out / "debiased.mcap"
     rrd, page = out / "demo.rrd", out / "report.html"
     say(f"1. Making up {len(names)} flights, as raw files of the EuRoC layout: {raw}")
-    for number, name in zip((*TRAINING_SEEDS, seed), names, strict=True):
+    for number, name in zip((*TRAINING_SEEDS, TEST_SEED), names, strict=True):
         write_asl(made_up(number), raw / name)
     say(f"2. Converting them to MCAP: {logs}")
     convert(raw, logs, format="euroc", sequences=names, overwrite=overwrite)
     say(f"3. Training the neural ODE on {len(TRAINING_SEEDS)} of them: {model}")
     training = [logs / f"{name}.mcap" for name in names[:-1]]
-    chosen = settings or TrainSettings(steps=STEPS)
-    train(training, model, method="neural_ode", settings=chosen, overwrite=overwrite, progress=progress)
+    train(training, model, method="neural_ode", settings=TrainSettings(steps=STEPS), overwrite=overwrite, progress=progress)
     say(f"4. Debiasing the one it has not seen, without its truth: {debiased}")
     debias(log, debiased, model=model, overwrite=overwrite)
     say("5. Measuring against the truth, drawing")
-    results = evaluate(log, models=["static", model])
+    results = msgspec.convert(evaluate(log, models=["static", model]), list[Score])
     data = load(log, models=["static", model])
     scene.save([data], rrd, overwrite=overwrite)
     pictures = report.write_pngs(data, out / "pictures", overwrite=overwrite)
     report.write_page([data], page, overwrite=overwrite)
     png = next(path for path in pictures if path.stem.endswith("-errors"))
-    return Demo(log, debiased, model, rrd, png, page, results)
+    return DemoReport(results, *map(str, (log, debiased, model, rrd, png, page)))
 
 
 def made_up(seed: int) -> Recording:

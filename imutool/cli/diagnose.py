@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli.app import COMMON, Common, Imu, Truth, Written, app
+from imutool.cli.app import COMMON, Common, Imu, Set, Truth, Written, app
 from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import logger, say, table
 
@@ -54,9 +54,7 @@ def diagnose(
         Path | None,
         typer.Option(metavar="FILE.toml", help="Settings; imutool.diagnosis.settings.DiagnoseSettings lists them."),
     ] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="key=value", help="Change one setting. Repeatable.")
-    ] = None,
+    set_: Set = None,
     imu: Imu = None,
     truth: Truth = None,
     common: Common = COMMON,

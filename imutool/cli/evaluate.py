@@ -117,7 +117,7 @@ def evaluate(
             read: dict[str, Any] = {"init": init, "smooth": smooth, "truth": truth, "imu": imu}
             more: dict[str, Any] = {"trajectories": trajectories, "overwrite": common.overwrite, "refused": refused.__setitem__}
             results += run(log, models=model or (), aid=asked, **read, **more)
-            errors += [_of_model(name, error) for name, error in refused.items()]
+            errors += [error.replaced(what=f"the model {name} is not scored: {error.what}") for name, error in refused.items()]
             if report is not None:
                 scored = [name for name in model or () if name not in refused]
                 run_data = load(log, models=scored, aid=asked, **read)
@@ -131,21 +131,10 @@ def evaluate(
         figures(rows, aligned=aligned)
         for sentence in [*_used(results), *_late(results), *_fits(results), *([] if report is None else [f"Report: {report}"])]:
             say(sentence)
-    _raise_first(errors)
-
-
-def _raise_first(errors: Sequence[ImutoolError]) -> None:
     for error in errors[1:]:
         logger.warning("%s", error)
     if errors:
         raise errors[0]
-
-
-def _of_model(name: str, error: ImutoolError) -> ImutoolError:
-    """The error of a model that does not apply, with the model's name."""
-    return type(error)(
-        f"the model {name} is not scored: {error.what}", where=error.where, expected=error.expected, fix=error.fix
-    )
 
 
 def _fits(results: Sequence[dict[str, Any]]) -> list[str]:
@@ -186,12 +175,12 @@ def vio(
     bias_states: Annotated[
         bool | None, typer.Option("--bias-states/--no-bias-states", help="Estimate biases, or trust the IMU; by default both.")
     ] = None,
-    lag: Annotated[float, typer.Option(metavar="S", help="Lag of the fixed-lag smoother.")] = 3.0,
+    lag: Annotated[float, typer.Option(metavar="SECONDS", help="Lag of the fixed-lag smoother.")] = 3.0,
     keyframes: Annotated[float, typer.Option(metavar="HZ", help="Camera keyframes per second.")] = 4.0,
     features: Annotated[int, typer.Option(help="Feature tracks in a frame.")] = 30,
     pixel_noise: Annotated[float, typer.Option(metavar="PX", help="White noise of a pixel coordinate.")] = 1.0,
-    blackout: Annotated[float, typer.Option(metavar="S", help="Length of a camera blackout in every 15 s.")] = 0.0,
-    duration: Annotated[float | None, typer.Option(metavar="S", help="Use only this much of each log.")] = None,
+    blackout: Annotated[float, typer.Option(metavar="SECONDS", help="Length of a camera blackout in every 15 s.")] = 0.0,
+    duration: Annotated[float | None, typer.Option(metavar="SECONDS", help="Use only this much of each log.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of landmarks, tracks and pixel noise.")] = 0,
     set_: Annotated[
         list[str] | None,

@@ -128,7 +128,7 @@ def debias(
 @_command("repair logs/ repaired/ --report repaired.html")
 def repair(
     damaged: Annotated[
-        str, typer.Option(metavar="drop|keep", help="Drop damaged bytes, or keep them as attachments.")
+        str, typer.Option(metavar="drop|keep", help="Drop damaged bytes, or keep them as attachments (MCAP).")
     ] = "drop",
 ) -> Settings:
     """Repair every log and ROS 1 bag, as `imutool repair` does; copy intact ones."""

@@ -129,7 +129,7 @@ def _open(served: Catalog, segments: Sequence[Segment], web: bool) -> None:
     if web:
         with Server() as page:
             page.policy = policy_with(served.origin)
-            page.offer(catalog_site("fleet", urls, served.origin))
+            page.offer(catalog_site(urls, served.origin))
             say(f"Open {page.url} in a browser on this machine; Ctrl-C ends it.")
             sys.stdout.flush()
             page.serve()

@@ -67,7 +67,7 @@ def flags(command: Any) -> dict[str, str]:
 
 
 def instead_of(option: str, command: Any) -> list[str]:
-    """What a click command has for the purpose of an option that it lacks."""
+    """Options of a click command that serve the purpose of one that it lacks."""
     from difflib import get_close_matches  # every command would pay for it at its start
 
     own = [_flag(parameter) for parameter in command.params]
@@ -112,7 +112,7 @@ def error_with_flags(error: ImutoolError, flag_of: Mapping[str, str], typed: Col
         if None not in shown:
             where = ", ".join(map(str, shown))
     what, expected, fix = (with_flags(text, flag_of) for text in (error.what, error.expected, error.fix))
-    return type(error)(what, where=where, expected=expected, fix=fix)
+    return error.replaced(what=what, where=where, expected=expected, fix=fix)
 
 
 def _of_url(text: str) -> Path:

@@ -118,7 +118,7 @@ def conceal(
     longest: Annotated[
         float, typer.Option(min=20.0, metavar="SECONDS", help="Use at most this much of the trajectory.")
     ] = 75.0,
-    truth: Annotated[str | None, typer.Option(help="Topic of the true poses, where a log has several.")] = None,
+    truth: Truth = None,
     open_it: Annotated[bool, typer.Option("--open", help="Open the envelope in DIR and score DIR/findings.json.")] = False,
     findings: Annotated[Path | None, typer.Option(help="Score this findings file (with --open).")] = None,
     overwrite: Annotated[

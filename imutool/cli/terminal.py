@@ -38,12 +38,8 @@ class _Console(Console):
         raise BrokenPipeError
 
 
-def _width() -> int | None:
-    """Width of a table on stdout: the terminal's; without a terminal a line is as long as it needs to be."""
-    return None if sys.stdout.isatty() or "COLUMNS" in os.environ else LONGEST_ROW
-
-
-out, err = _Console(width=_width(), emoji=False), _Console(stderr=True, emoji=False)
+_width = None if sys.stdout.isatty() or "COLUMNS" in os.environ else LONGEST_ROW  # without a terminal no line is folded
+out, err = _Console(width=_width, emoji=False), _Console(stderr=True, emoji=False)
 
 
 def plain(text: str) -> str:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from imutool import registry
-from imutool.cli.app import COMMON, MODEL, Common, Imu, Logs, Truth, app, listing
+from imutool.cli.app import COMMON, MODEL, Common, Imu, Logs, Set, Truth, app, listing
 from imutool.cli.terminal import epoch_line, say, table
 from imutool.errors import ConfigError
 from imutool.report import UNSET, Report, Section, UnsetType
@@ -31,9 +31,7 @@ def train(
     config: Annotated[
         Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.training.settings.TrainSettings lists them.")
     ] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="key=value", help="Change one setting. Repeatable.")
-    ] = None,
+    set_: Set = None,
     physics: Annotated[
         Path | None,
         typer.Option(metavar="physics.toml", help="For hybrid: effects to fit; the neural ODE learns the rest."),

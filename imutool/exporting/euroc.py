@@ -96,8 +96,8 @@ def _best_imu(log: Log) -> str:
     derived = [t.name for t in every if t.is_derived]
     found = derived or [t.name for t in every]
     if len(found) != 1:
-        listed = ", ".join(found) or "none"
-        raise LogError(f"IMU topics: {listed}", where=log.path, expected="one", fix="Choose one with `imu`" if found else "")
+        what = f"the log has {len(found)} IMU topics: {', '.join(found)}" if found else "the log has no IMU"
+        raise LogError(what, where=log.path, expected="one", fix="Choose one with `imu`" if found else "")
     return found[0]
 
 
@@ -175,7 +175,7 @@ class _Asl:
                     with (images / name).open("xb") as file:
                         file.write(image)
                 except FileExistsError as error:
-                    raise LogError(f"two images at {t_ns} ns", where=topic, expected="increasing stamps") from error
+                    raise LogError(f"two images have the stamp {t_ns} ns", where=topic, expected="increasing stamps") from error
                 table.write(f"{t_ns},{name}\n")
                 done += 1
                 self.tell(done, frames.count, folder)

@@ -22,7 +22,7 @@ import msgspec
 
 from imutool.errors import ConfigError, LogError, redact, required
 from imutool.fleet.one_log import work
-from imutool.fleet.task import Result, Task
+from imutool.fleet.task import Result, Task, failed
 from imutool.processes import system
 from imutool.processes.worker_pool import ONE_THREAD, WorkerBugError, WorkerPool
 
@@ -92,32 +92,20 @@ def _work_quietly(task: Task, model: bytes | None) -> Result:
 def _refuse_too_much(wanted: int, most: int) -> None:
     if wanted > most:
         raise ConfigError(
-            f"{wanted / 2**30:.2f} GiB for each task",
+            f"{wanted / 2**30:.2f} GiB are asked for each task",
             where="memory_bytes",
             expected=f"at most {most / 2**30:.2f} GiB, which the largest machine has",
         )
 
 
-def _failed(task: Task, error: str, code: int) -> Result:
-    return Result(
-        key=task.key,
-        source=task.source.place,
-        target=task.target,
-        status="failed",
-        source_bytes=task.source.size,
-        error=redact(error),
-        exit_code=code,
-    )
-
-
 def _bug(task: Task, error: BaseException, trace: str) -> Result:
     logging.getLogger("imutool").info("%s: %s", task.source.place, trace)
-    return _failed(task, f"a bug, please report it: {error}", BUG)
+    return failed(task.key, task.source, f"a bug, please report it: {error}", BUG, task.target)
 
 
 def _died(task: Task, how: str) -> Result:
     why = f"its worker died, also where it ran alone ({how}). Look at this log by itself."
-    return _failed(task, why, LogError.exit_code)
+    return failed(task.key, task.source, why, LogError.exit_code, task.target)
 
 
 def _work_as_json(raw: bytes, model: bytes | None) -> bytes:
@@ -282,7 +270,7 @@ def _refuse_silence(address: str) -> None:
                 if connection.recv(4)[3:] != SETTINGS[3:4]:
                     raise OSError("what listens there does not speak gRPC")
     except (OSError, OverflowError) as error:
-        raise ConfigError(f"no answer ({error})", where=f"address={redact(address)}", expected="a Ray cluster") from error
+        raise ConfigError(f"nothing answers ({error})", where=f"address={redact(address)}", expected="a Ray cluster") from error
 
 
 def _ray() -> Any:

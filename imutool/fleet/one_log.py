@@ -70,7 +70,9 @@ def work(task: Task, model: bytes | None = None) -> Result:
         _clear(task, job.target)
         entries = COMMANDS[task.settings.command](job)
         _refuse_changed(task, job.source, job.target)
-        result = msgspec.structs.replace(result, **entries, **_measured(job.target))
+        result = msgspec.structs.replace(
+            result, **entries, target_bytes=identity(job.target)[0], target_sha256=sha256(job.target)
+        )
     except UntrustedError as error:
         result = msgspec.structs.replace(result, status="quarantined", error=str(error), exit_code=error.exit_code)
     except ImutoolError as error:
@@ -125,10 +127,6 @@ def _clear(task: Task, target: Location) -> None:
     if isinstance(target, Path):
         target.parent.mkdir(parents=True, exist_ok=True)
     remove_files(partial_files(to_location(task.out), [task.target, page_name(task.target)]))
-
-
-def _measured(target: Location) -> dict[str, Any]:
-    return {"target_bytes": identity(target)[0], "target_sha256": sha256(target)}
 
 
 def _debias(job: _Job) -> dict[str, Any]:

@@ -39,14 +39,14 @@ class Links:
     """
 
     page: Location
-    out: Location | None
+    out: Location
 
     def to(self, name: str) -> str:
         """URL of a file, escaped."""
         if isinstance(self.page, Path) and isinstance(self.out, Path):
             relative = os.path.relpath(self.out / name, self.page.parent.absolute())
             return quote(Path(relative).as_posix())
-        return quote(str(self.out / name if self.out is not None else name), safe="/:")
+        return quote(str(self.out / name), safe="/:")
 
 
 def write(
@@ -54,7 +54,7 @@ def write(
     settings: Settings,
     path: Location,
     *,
-    out: Location | None = None,
+    out: Location,
     seconds: float,
     source: str,
     comparison: Comparison | None = None,
@@ -83,9 +83,10 @@ def html(
     statistics = Statistics()
     for result in results:
         statistics.add(result)
+    conclusion = [*([] if comparison is None else [comparison.summary]), _how_whole(statistics)]
     body = [
         f"<h1>imutool fleet {text(settings.command)} of {text(source)}</h1>",
-        f'<p class="conclusion">{text(_conclusion(statistics, comparison))}</p>',
+        f'<p class="conclusion">{text(" ".join(conclusion))}</p>',
         *_numbers(statistics, seconds),
         *(_outliers(comparison) if comparison is not None else ()),
         *_trouble(statistics),
@@ -95,11 +96,6 @@ def html(
         *_provenance(settings),
     ]
     return document(f"Fleet {settings.command}: {source}", body, OWN_STYLE)
-
-
-def _conclusion(statistics: Statistics, comparison: Comparison | None) -> str:
-    whole = _how_whole(statistics)
-    return whole if comparison is None else f"{comparison.summary} {whole}"
 
 
 def _how_whole(statistics: Statistics) -> str:
@@ -221,11 +217,7 @@ def _spread(statistics: Statistics) -> Iterator[str]:
             caption = f"Initial bias of the {signal} over {len(rows)} IMUs, by axis"
             yield _figure(_axes(rows, f"{signal} bias ({UNITS[signal]})"), f"b{k}", caption)
     times = [(statistics.seconds, "seconds a log"), (statistics.speeds, "MB/s of one worker")]
-    yield _figure(
-        _histograms(times, "times"),
-        "t",
-        "Time and speed by log",
-    )
+    yield _figure(_histograms(times, "times"), "t", "Time and speed by log")
     if len(statistics.scores) > 1 and min(statistics.scores) < max(statistics.scores):
         yield _figure(_histograms([(statistics.scores, "quality score")], "scores"), "q", "Quality")
 

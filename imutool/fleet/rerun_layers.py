@@ -98,13 +98,10 @@ def _facts(row: Mapping[str, Any]) -> dict[str, float | str]:
     """Facts of a row: status, score, robot, counts, and the sizes of the first IMU's biases."""
     facts = {name: row[name] for name in ("status", "score", "robot", "duration_s") if row[name] is not None}
     facts |= {name: len(row[name]) for name in ("losses", "effects") if row[name] is not None}
-    return facts | _bias_sizes(row["biases"][0]) if row["biases"] else facts
-
-
-def _bias_sizes(bias: Mapping[str, Any]) -> dict[str, float]:
-    """Lengths of a gyro's and an accelerometer's bias."""
-    gyro, accel = (float(np.linalg.norm(bias[name])) for name in ("gyro_rad_s", "accel_m_s2"))
-    return {"gyro_bias_deg_s": float(np.rad2deg(gyro)), "accel_bias_m_s2": accel}
+    for bias in row["biases"][:1]:
+        gyro, accel = (float(np.linalg.norm(bias[name])) for name in ("gyro_rad_s", "accel_m_s2"))
+        facts |= {"gyro_bias_deg_s": float(np.rad2deg(gyro)), "accel_bias_m_s2": accel}
+    return facts
 
 
 def _joined(before: FleetLog | None, log: FleetLog) -> FleetLog:
@@ -168,10 +165,9 @@ def layer_of(entity: str) -> str:
 
 def _write(log: FleetLog, data: RunData, cache: Path) -> None:
     """Write the files of a log, raw last: it stands for all."""
-    import rerun as rr
     from rerun.chunk import LazyChunkStream, RrdReader
 
-    from imutool.viewing.rerun import scene, sdk
+    from imutool.viewing.rerun import rr, scene, sdk
 
     whole = sdk.new_stream(log.name, application=APPLICATION, recording=log.name)
     with tempfile.TemporaryDirectory() as folder:
@@ -225,14 +221,5 @@ def _diagnosis_text(path: Path) -> str:
     found = [] if isinstance(unit.diagnosis, msgspec.UnsetType) else unit.diagnosis.get("findings", [])
     names = ", ".join(escape(str(finding.get("effect"))) for finding in found) or "no effect above the noise"
     shared = "Parameters that the fleet is compared by:"
-    return "\n".join(
-        [
-            f"# Diagnosis of {escape(unit.robot)}",
-            "",
-            f"Found: {names}.",
-            "",
-            shared,
-            "",
-            *table(["effect", "parameter", "value"], rows),
-        ]
-    )
+    parameters = "\n".join(table(["effect", "parameter", "value"], rows))
+    return "\n\n".join([f"# Diagnosis of {escape(unit.robot)}", f"Found: {names}.", shared, parameters])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any
@@ -22,6 +22,7 @@ NAME = "fleet.parquet"
 ROWS = 4096  # in a group; of a million logs no more are held
 SCHEMA = "imutool.fleet-results/1"
 MOST_ROWS = 500  # in a table: more is for the Parquet file
+MAY_LACK = ("target", "error", "target_sha256", "robot", "peak_bytes", "host")  # columns that are null where they are empty
 TROUBLE = ("failed", "quarantined", "lost")
 
 
@@ -72,16 +73,17 @@ def write(results: Iterable[Result], path: Location) -> None:
     """
     pa = arrow()
     schema = _schema(pa)
+    waiting = iter(results)
     with Target(path, overwrite=True) as target, pa.parquet.ParquetWriter(_Sink(target), schema, compression="zstd") as out:
-        for rows in _batches(results):
+        while rows := [row(result) for result in islice(waiting, ROWS)]:
             out.write_table(_table(rows, schema, pa))
 
 
 def _table(rows: list[dict[str, Any]], schema: Any, pa: Any) -> Any:
-    """Rows as a table, by way of JSON lines: pyarrow looks at Python objects with pandas, whose import takes a second."""
+    """Table with the columns of the schema, by way of JSON: for Python objects pyarrow imports pandas, which takes a second."""
     from pyarrow.json import ParseOptions, ReadOptions, read_json
 
-    lines = b"\n".join(map(msgspec.json.encode, rows))
+    lines = b"\n".join(msgspec.json.encode({name: values[name] for name in schema.names}) for values in rows)
     columns = ParseOptions(explicit_schema=pa.schema([(column.name, _without_lengths(column.type, pa)) for column in schema]))
     return read_json(pa.BufferReader(lines), ReadOptions(block_size=len(lines) + 1), columns).cast(schema)
 
@@ -127,39 +129,13 @@ def _schema(pa: Any) -> Any:
 
 
 def row(result: Result) -> dict[str, Any]:
-    """Row of a result; a failed log has nulls."""
-    known = result.status != "failed"
-    return {
-        "source": result.source,
-        "target": result.target or None,
-        "status": result.status,
-        "earlier": result.earlier,
-        "error": result.error or None,
-        "exit_code": result.exit_code,
-        "losses": list(result.losses),
-        "warnings": list(result.warnings),
-        "score": result.score,
-        "seconds": result.seconds,
-        "cpu_seconds": result.cpu_seconds,
-        "source_bytes": result.source_bytes,
-        "target_bytes": result.target_bytes if known else None,
-        "target_sha256": result.target_sha256 or None,
-        "messages": result.messages if known else None,
-        "duration_s": result.duration_s,
-        "biases": [
-            {"topic": imu.topic, "gyro_rad_s": list(imu.gyro_bias), "accel_m_s2": list(imu.accel_bias)} for imu in result.imus
-        ],
-        "models": [imu.model for imu in result.imus],
-        "init_how": [imu.init_how for imu in result.imus],
-        "robot": result.robot or None,
-        "effects": None if result.effects is None else list(result.effects),
-        "parameters": [
-            {"effect": p.effect, "name": p.name, "value": p.value, "std": p.std, "unit": p.unit} for p in result.parameters
-        ],
-        "peak_bytes": result.peak_bytes or None,
-        "host": result.host or None,
-        "key": result.key,
-    }
+    """Row of a result; what it lacks is null."""
+    lacking = [name for name in MAY_LACK if not getattr(result, name)]
+    lacking += ["target_bytes", "messages"] if result.status == "failed" else []
+    biases = [{"topic": imu.topic, "gyro_rad_s": imu.gyro_bias, "accel_m_s2": imu.accel_bias} for imu in result.imus]
+    models, starts = [imu.model for imu in result.imus], [imu.init_how for imu in result.imus]
+    found = {"biases": biases, "models": models, "init_how": starts, **dict.fromkeys(lacking)}
+    return {**msgspec.to_builtins(result), **found}
 
 
 @dataclass
@@ -209,12 +185,6 @@ def _without_topic(warning: str) -> str:
     """Words of a warning about a topic, so that equal ones of many logs count together."""
     topic, _, words = warning.partition(": ")
     return words if words and " " not in topic else warning
-
-
-def _batches(results: Iterable[Result]) -> Iterator[list[dict[str, Any]]]:
-    waiting = iter(results)
-    while rows := [row(result) for result in islice(waiting, ROWS)]:
-        yield rows
 
 
 class _Sink:

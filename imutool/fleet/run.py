@@ -23,7 +23,7 @@ from imutool.fleet.results import FleetSummary, LogProblem
 from imutool.fleet.robots import Comparison, compare
 from imutool.fleet.sources import Found, find, with_simulations
 from imutool.fleet.targets import page_name, partial_files, remove_files, target_name
-from imutool.fleet.task import FINAL, Result, Settings, Source, Task
+from imutool.fleet.task import FINAL, Result, Settings, Source, Task, failed
 from imutool.report import UNSET
 
 COMPARED = "fleet.json"
@@ -211,15 +211,7 @@ class _Fleet:
                 error = ConfigError(
                     "the target exists", where=self.out / self._name(source), fix="Choose another `out`, or add `overwrite`"
                 )
-                yield Result(
-                    key=source.key(self.settings),
-                    source=source.place,
-                    target="",
-                    status="failed",
-                    source_bytes=source.size,
-                    error=str(error),
-                    exit_code=error.exit_code,
-                )
+                yield failed(source.key(self.settings), source, str(error), error.exit_code)
 
     def tasks(self, journal: Journal) -> Iterator[Task]:
         """Tasks of the other logs; the journal notes each before it starts."""

@@ -35,23 +35,8 @@ from imutool.fleet.task import Source
 logger = logging.getLogger(__name__)
 
 LOG, BAG = ".mcap", ".bag"
-RAW = (
-    BAG,
-    ".db3",
-    ".ulg",
-    ".csv",
-    ".tsv",
-    ".xlsx",
-    ".parquet",
-    ".npz",
-    ".mat",
-    ".h5",
-    ".hdf5",
-    ".zip",
-    ".tar",
-    ".tgz",
-    ".tar.gz",
-)
+TABLES, ARCHIVES = (".csv", ".tsv", ".xlsx", ".parquet", ".npz", ".mat", ".h5", ".hdf5"), (".zip", ".tar", ".tgz", ".tar.gz")
+RAW = (BAG, ".db3", ".ulg", *TABLES, *ARCHIVES)
 CONVERT = "imutool convert makes logs of other recordings"
 PATTERN = re.compile(r"[*?\[]")
 

@@ -9,6 +9,7 @@ from typing import Literal
 import msgspec
 
 from imutool import __version__
+from imutool.errors import redact
 
 Command = Literal["debias", "repair", "info", "diagnose"]
 Status = Literal["ok", "lost", "failed", "quarantined", "skipped"]
@@ -142,6 +143,19 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, tag_field="line", tag="d
     exit_code: int = 0
     peak_bytes: int = 0  # the most memory that the worker has held so far
     host: str = ""
+
+
+def failed(key: str, source: Source, error: str, exit_code: int, target: str = "") -> Result:
+    """Result of a log that was not worked on to the end."""
+    return Result(
+        key=key,
+        source=source.place,
+        target=target,
+        status="failed",
+        source_bytes=source.size,
+        error=redact(error),
+        exit_code=exit_code,
+    )
 
 
 class Task(msgspec.Struct, frozen=True, kw_only=True):

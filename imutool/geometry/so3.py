@@ -6,7 +6,7 @@ Right convention throughout: `R_wb` takes body vectors to world and dR/dt = R_wb
 d Exp(xi)/dt = Exp(xi) [J_r(xi) dxi/dt]x (Barfoot, State Estimation for Robotics, 2017, eq. 7.77a; Chirikjian 2012).
 
 Every function of the angle is a function of s = |xi|², which is analytic: no square root is differentiated at zero, so
-values and all derivatives are finite everywhere, also at xi = 0. Below `_SERIES[dtype].below` a Taylor series in s replaces
+values and all derivatives are finite everywhere, also at xi = 0. Below `_BELOW` a Taylor series in s replaces
 the closed form.
 
 Reason for the threshold: the closed forms subtract nearly equal numbers. In the matrices the loss stays at one rounding (the
@@ -21,7 +21,6 @@ not taken.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,19 +33,8 @@ Quaternions = Float[Tensor, "*batch 4"]
 Angles2 = Float[Tensor, "*batch"]
 
 
-class _Series(NamedTuple):
-    """Taylor series in the squared angle: its threshold `below` and number of `terms`."""
-
-    below: float
-    terms: int
-    atan_below: float  # the same for atan(r) / r, in r²
-    atan_terms: int
-
-
-_SERIES = {
-    torch.float32: _Series(below=0.25, terms=5, atan_below=1e-2, atan_terms=5),
-    torch.float64: _Series(below=0.25, terms=9, atan_below=1e-2, atan_terms=9),
-}
+_BELOW, _ATAN_BELOW = 0.25, 1e-2  # of the squared angle a series is taken, and of r² one for atan(r) / r
+_TERMS = {torch.float32: 5, torch.float64: 9}
 
 # sin(x)/x, (1 - cos x)/x², (1 - sin(x)/x)/x² and 1/x² - cot(x/2)/(2x), each as a series in s = x².
 _SINC = (
@@ -162,10 +150,11 @@ def _squared(v: Float[Tensor, "*batch n"]) -> Angles2:
     return (v * v).sum(dim=-1)
 
 
-def _series_of(dtype: torch.dtype) -> _Series:
-    if dtype not in _SERIES:
+def _terms(coefficients: tuple[float, ...], dtype: torch.dtype) -> tuple[float, ...]:
+    """First coefficients of a series, as many as a type of numbers needs."""
+    if dtype not in _TERMS:
         raise TypeError(f"rotations are computed in float32 or float64, not {dtype}")
-    return _SERIES[dtype]
+    return coefficients[: _TERMS[dtype]]
 
 
 def _horner(coefficients: tuple[float, ...], s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
@@ -177,11 +166,10 @@ def _horner(coefficients: tuple[float, ...], s: Float[Tensor, "*batch"]) -> Floa
 
 def _analytic(s: Angles2, coefficients: tuple[float, ...], closed_form: Callable[[Angles2], Angles2]) -> Angles2:
     """Function of the angle: a series where it is small, else the closed form, which sees no small angle."""
-    series = _series_of(s.dtype)
-    small = s < series.below
+    series, small = _terms(coefficients, s.dtype), s < _BELOW
     if bool(small.all()):
-        return _horner(coefficients[: series.terms], s)
-    value = _horner(coefficients[: series.terms], torch.where(small, s, torch.zeros_like(s)))
+        return _horner(series, s)
+    value = _horner(series, torch.where(small, s, torch.zeros_like(s)))
     return torch.where(small, value, closed_form(torch.where(small, torch.ones_like(s), s).sqrt()))
 
 
@@ -205,13 +193,12 @@ def _half_cot(s: Angles2) -> Angles2:
 
 def _atan2_over(n2: Float[Tensor, "*batch"], w: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """atan2(n, w) / n from n² and w >= 0; for small n / w as (1 / w) (1 - r²/3 + r⁴/5 - ...)."""
-    series = _series_of(n2.dtype)
-    small = n2 < series.atan_below * w.square()
+    small = n2 < _ATAN_BELOW * w.square()
     one = torch.ones_like(n2)
     w_small = torch.where(small, w, one)
     ratio2 = torch.where(small, n2, torch.zeros_like(n2)) / w_small.square()
     n = torch.where(small, one, n2).sqrt()
-    return torch.where(small, _horner(_ATAN[: series.atan_terms], ratio2) / w_small, torch.atan2(n, w) / n)
+    return torch.where(small, _horner(_terms(_ATAN, n2.dtype), ratio2) / w_small, torch.atan2(n, w) / n)
 
 
 def _quaternion_outer(R: Rotations) -> Float[Tensor, "*batch 4 4"]:

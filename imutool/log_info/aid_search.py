@@ -74,7 +74,7 @@ def find_aids(log: Log, recording: Recording, asked: dict[str, str]) -> Aids:
 
 
 def _with_height(found: Aids, log: Log, recording: Recording, signal: str) -> Aids:
-    """With the height of a barometer."""
+    """Adds the height of a barometer."""
     if signal in log.topics and log.topics[signal].schema_name == PRESSURE:
         signal += ".fluid_pressure"
     topic, field = split(log, signal)

@@ -164,7 +164,7 @@ def check_one_sensor(recordings: Sequence[Recording]) -> None:
     if len({sensor for sensor in stated.values() if sensor}) > 1:
         listed = ", ".join(f"{name}: {sensor or 'not stated'}" for name, sensor in stated.items())
         raise DataError(
-            f"logs of different sensors ({listed})", expected="logs of one sensor", fix="Take each sensor by itself"
+            f"the logs are of different sensors ({listed})", expected="logs of one sensor", fix="Take each sensor by itself"
         )
 
 
@@ -197,7 +197,7 @@ def check_units(whole: TopicSummary, where: str) -> None:
 
 
 def conventions(whole: TopicSummary) -> list[Convention]:
-    """What the motion shows of each convention."""
+    """Lists what the motion shows of each convention."""
     return [Convention(*entry) for entry in _entries(whole, whole.conventions)]
 
 

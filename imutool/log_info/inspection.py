@@ -65,7 +65,7 @@ def inspect(path: Location, *, check: bool = True, max_chunk: int | None = None)
 
 
 def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
-    """As `inspect`, of a log that is open.
+    """Reports the contents of a log that is open.
 
     Raises:
         LogError: nothing in it is sound.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +33,7 @@ SAME_TURN = 1e-9  # of two quaternions, how far the product may be from 1
 
 
 class Agreement(NamedTuple):
-    """What poses explain of the gyro, and how their body is turned."""
+    """Part of the gyro that poses explain, and the rotation of their body."""
 
     rms_rad_s: float
     explained: float
@@ -122,13 +122,11 @@ def motion_warnings(topic: str, explained: float, rms_rad_s: float, jumps: int, 
             " inverted or in another order"
         )
         return [f"the poses {topic} explain {explained:.0%} of the gyro's motion: {causes}"]
+    if not jumps:
+        return []
     often = "once" if jumps == 1 else f"{jumps} times"
     said = f"the poses {topic} turn by up to {largest_deg:.0f}° in 0.1 s that the gyro does not show, {often}"
-    return (
-        [f"{said}: markers that were exchanged or hidden, a gyro at the end of its range, or clocks that differ"]
-        if jumps
-        else []
-    )
+    return [f"{said}: markers that were exchanged or hidden, a gyro at the end of its range, or clocks that differ"]
 
 
 class Body(NamedTuple):
@@ -164,19 +162,20 @@ def body_of(log: Log, topic: str, turn: Float64[np.ndarray, "3 3"]) -> Body:
 
     A frame whose transforms have the same orientations is the same body.
     """
-    poses = read_truth(log, topics=[topic])
-    assert poses is not None, "what judged its body has read it"
-    alike, other = set[str](), set[str]()
-    for named in log.with_schema((schemas.TF,)):
-        for batch in log.pose_batches(named.name):
-            _, mine, theirs = np.intersect1d(poses.t_ns, batch.stamp_ns, return_indices=True)
-            same = np.abs((poses.q_wb_wxyz[mine] * batch.q_wb_wxyz[theirs]).sum(axis=1)) > 1.0 - SAME_TURN
-            (alike if len(same) and same.all() else other).add(batch.child_frame_id)
-    return Body(turn, frozenset(alike - other))
+
+    def same(poses: Float64[np.ndarray, "n 7"], frames: Float64[np.ndarray, "n 7"]) -> bool:
+        return bool((np.abs((poses[:, 3:] * frames[:, 3:]).sum(axis=1)) > 1.0 - SAME_TURN).all())
+
+    return Body(turn, _frames_alike(log, topic, same))
 
 
 def frames_of_copies(log: Log, topic: str) -> frozenset[str]:
     """Frames of transforms whose positions are those of a topic, wherever they share a stamp."""
+    return _frames_alike(log, topic, lambda poses, frames: np.array_equal(poses[:, :3], frames[:, :3]))
+
+
+def _frames_alike(log: Log, topic: str, same: Callable[..., bool]) -> frozenset[str]:
+    """Frames of transforms that share stamps with a topic and are there the `same`, by positions and quaternions."""
     poses = read_truth(log, topics=[topic])
     alike, other = set[str](), set[str]()
     if poses is None:
@@ -184,8 +183,9 @@ def frames_of_copies(log: Log, topic: str) -> frozenset[str]:
     for named in log.with_schema((schemas.TF,)):
         for batch in log.pose_batches(named.name):
             _, mine, theirs = np.intersect1d(poses.t_ns, batch.stamp_ns, return_indices=True)
-            same = len(mine) > 0 and np.array_equal(poses.p_wb[mine], batch.p_wb[theirs])
-            (alike if same else other).add(batch.child_frame_id)
+            own = np.hstack([poses.p_wb, poses.q_wb_wxyz])[mine]
+            frame = np.hstack([batch.p_wb, batch.q_wb_wxyz])[theirs]
+            (alike if len(mine) and same(own, frame) else other).add(batch.child_frame_id)
     return frozenset(alike - other)
 
 

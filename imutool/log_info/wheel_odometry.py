@@ -62,7 +62,7 @@ def find_wheels(log: Log, recording: Recording) -> tuple[list[str], str]:
 
 
 def with_odometry(found: Aids, log: Log, recording: Recording, name: str) -> Aids:
-    """With the velocity of wheel odometry, on the clock of the IMU.
+    """Adds the velocity of wheel odometry, on the clock of the IMU.
 
     Raises:
         DataError: the truth itself, another motion or unit than the IMU's, or a motion that does not show the mount.

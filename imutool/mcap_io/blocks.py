@@ -224,7 +224,7 @@ def too_large(what: str, offset: int, size: int, max_chunk: int) -> LogError:
 
 
 def cut_short(source: Source) -> LogError:
-    """Where a log without an end stops, found by following its records."""
+    """Error that says where a log without an end stops, found by following its records."""
     position, opcode, inside = len(MAGIC), 0, False
     while source.size - position >= HEAD.size and not inside:
         opcode, length = source.head(position)

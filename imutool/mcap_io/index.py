@@ -132,7 +132,7 @@ class LogIndex:
                 self.lose(item, error)
 
     def unpack_bytes(self, block: MessageBlock, raw: bytes) -> messages.Messages:
-        """As `unpack`, from the block's bytes."""
+        """The messages of a block whose bytes are read already, CRC checked."""
         if block.compression is None:
             return messages.parse(raw, block.offset)
         data = records.unpack(raw, block.offset, self.max_chunk, block.head(raw))
@@ -140,7 +140,7 @@ class LogIndex:
         return (None if offsets is None else messages.parse_at(data, offsets)) or messages.parse(data, block.offset)
 
     def entries(self, block: MessageBlock, channel: int) -> UInt64[np.ndarray, "n 2"]:
-        """As `blocks.read_entries`."""
+        """The message index of one channel of a block."""
         return read_entries(self.source, block, channel)
 
     # ── building the index ───────────────────────────────────────────────────────────────────────────────────────────

@@ -288,7 +288,7 @@ def repaired(source: Location, beside: Location, max_chunk: int | None = None) -
         yield copy, repair(source, copy, max_chunk=max_chunk).losses
     except ImutoolError as error:  # the user does not know the copy
         where = None if error.where is None else str(error.where).replace(str(copy), str(source))
-        raise type(error)(error.what, where=where, expected=error.expected, fix=error.fix) from error
+        raise error.replaced(where=where) from error
     finally:
         with suppress(io_errors(copy)):
             copy.unlink()

@@ -29,7 +29,6 @@ from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.messages import Messages
 from imutool.mcap_io.codec.records import HEAD, ChunkHead
 from imutool.mcap_io.file_writer import Chunk, LogWriter
-from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.added_topics import DerivedStream, DerivedTopics, check_new_topics, define
 from imutool.mcap_io.passthrough.chunk_check import check_chunk, parts_of
@@ -95,8 +94,8 @@ def rewrite(
     place = (path.resolve() if isinstance(path, Path) else path) if target is None else target
     with nullcontext(source) if isinstance(source, Log) else Log(source) as log:
         check_new_topics(log, {topics.source_topic: topics.topics for topics in derived})
-        crc, packing = bool(stated_crc(log.index)), _compression(log.index)
-        header, replace = log.index.header_bytes, overwrite or target is None
+        packing = next((block.compression for block in log.index.blocks if block.compression is not None), "none")
+        crc, header, replace = bool(stated_crc(log.index)), log.index.header_bytes, overwrite or target is None
         with LogWriter(place, compression=packing, overwrite=replace, header=header, data_crc=crc) as out:
             report = _Rewrite(log, out, derived, check, own_encoding, progress or (lambda *_: None)).run(metadata)
             if target is None and isinstance(path, Path) and isinstance(out.target.temporary, Path):
@@ -111,11 +110,6 @@ def _copy_permissions(source: Path, target: Path) -> None:
     status = source.stat()
     give(target, status)
     target.chmod(status.st_mode & 0o7777)
-
-
-def _compression(index: LogIndex) -> str:
-    """Compression of the source's first chunk, for the new chunks."""
-    return next((b.compression for b in index.blocks if b.compression is not None), "none")
 
 
 class _Rewrite:

@@ -70,7 +70,7 @@ class Topic:
 
     @property
     def pose_kind(self) -> str:
-        """What the topic's poses are worth: `truth`, `estimate`, `odometry` or `unknown`.
+        """Kind of the topic's poses: `truth`, `estimate`, `odometry` or `unknown`.
 
         The channel's metadata state it (`convert --kind`); else the words of the topic's name, then the message type.
         """

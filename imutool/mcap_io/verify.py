@@ -41,7 +41,7 @@ def check_mode(mode: str) -> None:
         ConfigError: not one of `MODES`.
     """
     if mode not in MODES:
-        raise ConfigError(f"{mode!r}", where="check", expected=", ".join(MODES))
+        raise ConfigError(f"unknown mode {mode!r}", where="check", expected=", ".join(MODES))
 
 
 def verify(
@@ -74,7 +74,7 @@ def verify_index(
     proven: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
-    """As `verify`, of a log that is open.
+    """Checks an open log as `verify` does; returns how many chunks were unpacked.
 
     With `proven` a chunk without CRC is an error, as is a definition that the summary lacks.
 

@@ -206,7 +206,7 @@ def _image_chunks(channel: int, buffer: MessageBuffer, topic: str, frames: Frame
 
 
 def about_imu(entries: Mapping[str, str], topic: str, own_topic: str | None = None) -> dict[str, str]:
-    """What a log's record `imutool` says of one of its IMUs: the sensor is that of `imu_topic`."""
+    """Entries of the record `imutool` about one IMU; the sensor is that of `imu_topic`."""
     own = own_topic or entries.get("imu_topic") or topic
     named = topic == own or topic.startswith(f"{own}/")  # what is computed from an IMU lies below it
     return {key: value for key, value in entries.items() if named or key != "sensor"}

@@ -127,7 +127,7 @@ def read(name: str | Path) -> Noise:
     path = Path(name)
     if not path.exists():
         raise ConfigError(
-            "no such noise",
+            "there is no such noise",
             where=path,
             expected=f"{', '.join(SHEETS)} or a TOML file",
             fix=did_you_mean(str(name), SHEETS),
@@ -137,7 +137,7 @@ def read(name: str | Path) -> Noise:
 
 
 def _axes(value: Any) -> Any:
-    """What TOML says of a quantity as a list of three; what is neither goes on as it is, to be refused with its place."""
+    """Turns a quantity of TOML into a list of three; any other value stays, to be refused with its place."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return [float(value)] * 3
     if value == UNKNOWN:

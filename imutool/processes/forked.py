@@ -81,7 +81,7 @@ class Forked(Generic[T]):
         return not self._process and self._got is None
 
     def result(self) -> T:
-        """What the function returns; run here if no process has run it to its end."""
+        """Result of the function; it runs here if no process has run it to its end."""
         if self._process:
             self._read()
         if self._got is None:
@@ -93,7 +93,7 @@ class Forked(Generic[T]):
         return value
 
     def ready(self) -> T | None:
-        """What a process has made by now; none, and no process any more, where it has not. Its log lines are dropped."""
+        """Result that a process has by now; else None, and the process ends. Its log lines are dropped."""
         if self._process and select.select([self], [], [], 0)[0]:
             self._read()
         self.end()

@@ -57,21 +57,14 @@ class WorkerDiedError(Exception):
 
 
 class WorkerBugError(Exception):
-    """Exception that the function raised, as text."""
+    """Exception that the function raised, as text: it need not pickle itself."""
 
-    def __init__(self, error: BaseException) -> None:
-        super().__init__(repr(error))
-        self.trace = "".join(traceback.format_exception(error))
+    def __init__(self, text: str, trace: str) -> None:
+        super().__init__(text, trace)  # with these it is pickled
+        self.trace = trace
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle as text: an exception need not pickle itself."""
-        return _bug, (self.args[0], self.trace)
-
-
-def _bug(text: str, trace: str) -> WorkerBugError:
-    error = WorkerBugError.__new__(WorkerBugError, text)
-    error.trace = trace
-    return error
+    def __str__(self) -> str:
+        return str(self.args[0])
 
 
 class Outcome(NamedTuple):
@@ -266,7 +259,7 @@ def _applied(function: Callable[[Any], Any], item: Any) -> bytes:
     try:
         return pickle.dumps(function(item))
     except Exception as error:  # noqa: BLE001  the other process reports it
-        return pickle.dumps(WorkerBugError(error))
+        return pickle.dumps(WorkerBugError(repr(error), "".join(traceback.format_exception(error))))
 
 
 def _listen(connection: Connection, items: queue.SimpleQueue[Any]) -> None:

@@ -1,4 +1,4 @@
-"""What a person looks at: the data behind every picture, and the viewer that shows it."""
+"""Pictures and pages of a log, the data behind them, and the viewer that shows them."""
 
 from __future__ import annotations
 

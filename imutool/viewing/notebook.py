@@ -44,9 +44,9 @@ def show(logs: Sequence[RunData], *, source: bool = True) -> Viewer:
             fix="Install it with: pip install 'imutool[notebook]', or show notebook.page(logs) instead",
         )
     from imutool.viewing.rerun import scene
-    from imutool.viewing.rerun.sdk import FLUSH_S, stream_of_logs
+    from imutool.viewing.rerun.sdk import FLUSH_S, new_stream, recording_name
 
-    recording = stream_of_logs(logs)
+    recording = new_stream(recording_name(logs))
     os.environ.setdefault(ASSET, INLINE)  # read when the next line first runs
     from rerun.notebook import Viewer
 

@@ -54,9 +54,7 @@ class RequestedOutputs:
     @property
     def opens_viewer(self) -> bool:
         """Whether a viewer opens: no output was requested."""
-        return (
-            self.connect is None and not self.web and all(p is None for p in (self.save, self.export_web, self.png, self.html))
-        )
+        return not self.needs_rerun and self.png is None and self.html is None
 
     @property
     def needs_rerun(self) -> bool:
@@ -89,24 +87,20 @@ class Outputs:
         _check_extras(asked)
         if not asked.needs_rerun:
             return
-        from imutool.viewing.rerun import connect, sdk, web
+        from imutool.viewing.rerun import connect, require_rerun, web
 
-        sdk.require_rerun()
+        require_rerun()
         if asked.export_web is not None:
             web.check_folder(asked.export_web, overwrite=asked.overwrite)
         if asked.connect is not None:
-            self._connect(connect.full_url(asked.connect))
+            url = connect.full_url(asked.connect)
+            try:
+                self._peer = connect.probe(url)
+            except ConfigError as error:
+                self.refused = error
+                logger.warning("%s", error)
         if asked.web:
             self._server = self._stack.enter_context(web.Server(asked.port))
-
-    def _connect(self, url: str) -> None:
-        from imutool.viewing.rerun import connect
-
-        try:
-            self._peer = connect.probe(url)
-        except ConfigError as error:
-            self.refused = error
-            logger.warning("%s", error)
 
     def show(self, logs: Sequence[RunData]) -> list[Output]:
         """Run every requested output, the slowest last.
@@ -184,7 +178,7 @@ def cursor_s(logs: Sequence[RunData], at: str) -> float:
     try:
         seconds = float(at)
     except ValueError as error:
-        raise ConfigError(f"{at!r}", where="at", expected="seconds since the first IMU sample, or worst") from error
+        raise ConfigError(f"{at!r} is no time", where="at", expected="seconds since the first IMU sample, or worst") from error
     if not 0.0 <= seconds <= longest:
         raise DataError(f"{at} s is outside the log", where="at", expected=f"0 to {longest:.3f} s")
     return seconds

@@ -97,7 +97,7 @@ EUROC = StereoRig(
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What is seen at one keyframe: each track's number and its pixels (u left, u right, v)."""
+    """Sight at one keyframe: each track's number and its pixels (u left, u right, v)."""
 
     tracks: Int64[np.ndarray, " m"]
     pixels: Float64[np.ndarray, "m 3"]
@@ -154,9 +154,9 @@ def observe(
 
 
 def blackouts(t_s: Float64[np.ndarray, " n"], length_s: float, every_s: float) -> Bool[np.ndarray, " n"]:
-    """Where the camera sees nothing.
+    """Marks the times at which the camera sees nothing.
 
-    The last `length_s` of every `every_s` seconds, so that the start is seen.
+    These are the last `length_s` of every `every_s` seconds, so that the start is seen.
     """
     return np.asarray(t_s % every_s >= every_s - length_s) if length_s > 0.0 else np.zeros(len(t_s), bool)
 

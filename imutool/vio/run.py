@@ -130,7 +130,7 @@ def plan(recording: Recording, settings: VioSettings) -> VioProblem:
     keyframes = _keyframes(imu.t_ns[rows], settings.keyframes_hz)
     if len(keyframes) < 2:
         raise DataError(
-            f"{(imu.t_ns[last] - imu.t_ns[first]) * 1e-9:.2f} s with truth",
+            f"the truth covers {(imu.t_ns[last] - imu.t_ns[first]) * 1e-9:.2f} s",
             where=recording.name,
             expected=f"two keyframes at {settings.keyframes_hz:g} Hz",
         )

@@ -36,9 +36,9 @@ LEAST_DISPARITY_PX = 1.0  # a first place is no further away than this, whatever
 
 
 class SmootherSettings(config.Settings, frozen=True, kw_only=True):
-    """What the smoother believes of the sensor and the start.
+    """Assumptions of the smoother about the sensor and the start.
 
-    The same for every run, so that only the samples differ.
+    They are the same for every run, so that only the samples differ.
 
     The noise densities are ten times a data sheet's, for vibration, scale and misalignment, chosen on training sequences for
     the raw IMU with bias states. The accelerometer's walk is that of EuRoC's sensor.yaml, the gyro's five times that (figures

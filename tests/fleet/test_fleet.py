@@ -213,7 +213,7 @@ def test_a_cluster_that_cannot_be_reached_is_told_without_its_secrets(
     with pytest.raises(ConfigError, match=r"cannot be reached at auto \(grpc: auto\).*`address`"):
         RayEngine("auto")
     for address in ("ray://me:hush@127.0.0.1:1", "127.0.0.1:1"):
-        with pytest.raises(ConfigError, match=r"address=.*127\.0\.0\.1:1: no answer") as error:
+        with pytest.raises(ConfigError, match=r"address=.*127\.0\.0\.1:1: nothing answers") as error:
             run(str(fleet), str(tmp_path / "out"), INFO, partial(RayEngine, address))
         assert "hush" not in str(error.value)
         assert not (tmp_path / "out").exists()  # nothing to resume, and nothing to overwrite
@@ -228,7 +228,7 @@ def test_a_port_where_something_else_listens_is_refused_in_time(monkeypatch: pyt
     monkeypatch.setattr(engines, "ANSWER_S", 0.3)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         began = time.monotonic()
-        with pytest.raises(ConfigError, match=r"no answer \(timed out\).*expected a Ray cluster"):
+        with pytest.raises(ConfigError, match=r"nothing answers \(timed out\).*expected a Ray cluster"):
             RayEngine(f"127.0.0.1:{silent.getsockname()[1]}")
         assert time.monotonic() - began < SOON_S
     engine = RayEngine(own)  # a cluster's own port answers as it should

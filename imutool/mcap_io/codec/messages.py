@@ -132,7 +132,7 @@ def scan(data: bytes | memoryview, *, bare: bool = False) -> tuple[Int64[np.ndar
 
 
 def _run(view: UInt8[np.ndarray, " b"], position: int, stride: int) -> int:
-    """How many records in a row start with the same opcode and length as the one at `position`.
+    """Number of records in a row that start with the same opcode and length as the one at `position`.
 
     The look ahead grows with the run: to look at the whole chunk for each short run takes time with the square of its size.
     """

@@ -187,7 +187,7 @@ def find_definitions(raw: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _records_start(raw: bytes) -> int:
-    """Where the records of a chunk without compression begin."""
+    """Start of the records of a chunk without compression; -1 for a chunk with one."""
     at = HEAD.size + CHUNK_HEAD.size
     return at + 8 if raw[at - 4 : at] == bytes(4) else -1
 

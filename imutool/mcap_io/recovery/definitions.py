@@ -28,7 +28,7 @@ SAMPLES = 4  # messages of a channel that must decode by a definition
 
 
 class Habits(NamedTuple):
-    """How a writer writes messages, the same in a whole log; empty where that is not known.
+    """Habits of a writer, the same in a whole log; empty where that is not known.
 
     `packing` are the compressions, or that there are no chunks; some writers leave small chunks as they are. `indexed` says
     whether message indexes follow the chunks.
@@ -82,7 +82,7 @@ class Recording:
         return used <= readable or ((self.headless or self.gapped) and not used.isdisjoint(readable))
 
     def meaning(self, channel: int) -> object:
-        """What a channel id means here, to compare; None where it is not defined."""
+        """Meaning of a channel id here, to compare; None where it is not defined."""
         known = self.channels.get(channel)
         if known is None or (known.schema_id and known.schema_id not in self.schemas):
             return None

@@ -26,7 +26,7 @@ class Loss:
     end_ns: int | None = None
 
     def plain(self) -> dict[str, Any]:
-        """As JSON values; `messages` is null where their number is not known."""
+        """Returns JSON values; `messages` is null where their number is not known."""
         return {
             "offset": self.offset,
             "bytes": self.length,
@@ -97,7 +97,7 @@ class Losses:
             self.harmless.append(what)
 
     def plain(self) -> dict[str, Any]:
-        """As JSON values; `messages` is null where their number is not known."""
+        """Returns JSON values; `messages` is null where their number is not known."""
         return {
             "whole": self.intact,
             "bytes": self.bytes,
@@ -130,7 +130,7 @@ def describe(losses: Mapping[str, Any]) -> list[str]:
 
 
 def unchecked(losses: Mapping[str, Any]) -> Iterator[str]:
-    """What nothing proves, in words."""
+    """Yields what nothing proves, in words."""
     if losses.get("assumed_messages"):
         yield f"{losses['assumed_messages']} messages behind damage are on their topics by nothing but their channel ids"
     if losses["unchecked_messages"]:
@@ -152,5 +152,5 @@ def _stretch(entry: Mapping[str, Any]) -> str:
 
 
 def reason(error: LogError) -> str:
-    """What an error says, as part of a line."""
+    """Text of an error, as part of a line."""
     return error.what + (f", expected {error.expected}" if error.expected else "")

@@ -54,12 +54,7 @@ def really_lost(scan: Scan, blocks: list[MessageBlock], summaries: list[Summary]
         entries = [entry for n, entry in missing if n == number]
         start = min(entry.chunk_start_offset for entry in entries)
         why = f"a summary lists {len(entries)} chunks that are not in the file"
-        gap = Gap(
-            min(max(0, start), scan.source.size),
-            0,
-            why,
-            recording=number,
-        )
+        gap = Gap(min(max(0, start), scan.source.size), 0, why, recording=number)
         _count(gap, entries)
         yield gap
 

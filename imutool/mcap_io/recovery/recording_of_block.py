@@ -245,7 +245,7 @@ class Recordings:
                 self.losses.add_harmless(f"the chunk at byte {other.offset} repeats the one at byte {kept.block.offset}")
 
     def _evidence(self, found: ScannedBlock) -> tuple[bool, int]:
-        """How well it is known what the messages of a block are."""
+        """Evidence for the definitions of a block: whether each is readable, and how much speaks for them."""
         readable = self.of(found.block).readable() - self.unproven.get(found.block.offset, {}).keys()
         return (found.block.counts or {}).keys() <= readable, found.evidence
 

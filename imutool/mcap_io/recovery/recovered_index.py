@@ -36,7 +36,7 @@ MAX_SEARCHED = 1 << 20  # bytes of a damaged stretch in which definitions are so
 
 
 class RecoveredIndex(LogIndex):
-    """As `LogIndex`, for a file that may be damaged; `losses` grows while chunks are read.
+    """Index of a file that may be damaged; `losses` grows while chunks are read.
 
     With `by_records` the index is not believed from the start, and all damage is known at once.
 
@@ -183,7 +183,7 @@ class RecoveredIndex(LogIndex):
         self.data_end = scan.data_ends[0] if len(scan.data_ends) == 1 else self.source.size
         self._drop_doubtful(scan)
         summaries = ([] if summary is None else [summary]) + scan.summaries
-        self.recordings = Recordings(summaries, self.losses, self._found_in)
+        self.recordings = Recordings(summaries, self.losses, lambda block: self._parse(block, self.read(block)))
         kept = {id(item) for item in self.items}
         self.recordings.assign([e for e in scan.events if not isinstance(e, ScannedBlock) or id(e.block) in kept])
         self.recordings.drop_copies([e for e in scan.events if isinstance(e, ScannedBlock)])
@@ -210,9 +210,6 @@ class RecoveredIndex(LogIndex):
             if not gap.counted:
                 gap.counts.update(block.counts or {})
         self.items = [item for item in self.items if id(item) not in dropped]
-
-    def _found_in(self, block: MessageBlock) -> messages.Messages:
-        return self._parse(block, self.read(block))
 
     def _parse(self, block: MessageBlock, raw: bytes) -> messages.Messages:
         contents = raw if block.compression is None else records.unpack(raw, block.offset, self.max_chunk)

@@ -34,7 +34,7 @@ class RecoveredLog(Log):
 
     @property
     def losses(self) -> Losses:
-        """What is lost so far; nothing of an intact log."""
+        """Losses so far; none of an intact log."""
         return self.index.losses
 
     def strict(self) -> Log:

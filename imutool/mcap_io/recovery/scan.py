@@ -215,10 +215,10 @@ class Scan(ScanResult):
                 while found.chunks and isinstance(self.events[-1], Definition) and self.events[-1].offset >= start:
                     self.events.pop()  # it says itself whose definitions these are
             self._closed = self.frames.is_magic(end)
-            self.events.append(LogEnd(end))
+            self.events.append(LogEnd(closed=True))
         elif opcode == Opcode.DATA_END:
             self.data_ends.append(position)
-            self.events.append(LogEnd(end, closed=False))
+            self.events.append(LogEnd(closed=False))
             self._ended, self.last, self._open_gap = True, None, None
             self._summary_starts.append(end)
         elif opcode in (Opcode.ATTACHMENT, Opcode.METADATA):

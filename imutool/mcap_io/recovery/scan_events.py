@@ -44,10 +44,9 @@ class LogStart(NamedTuple):
 
 
 class LogEnd(NamedTuple):
-    """End of a log: of its data section, or, if it is closed, its footer."""
+    """End of a log: its footer if it is closed, else the end of its data section."""
 
-    offset: int
-    closed: bool = True
+    closed: bool
 
 
 class Definition(NamedTuple):

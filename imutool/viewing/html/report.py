@@ -77,7 +77,7 @@ def page(logs: Sequence[RunData], drawn: Mapping[str, str] = NOTHING) -> str:
         ConfigError: no logs, or matplotlib is not installed.
     """
     if not logs:
-        raise ConfigError("no logs", where="report", expected="at least one")
+        raise ConfigError("no log is given", where="report", expected="at least one")
     require_matplotlib()
     if len(logs) == 1:
         body = [f"<h1>{text(logs[0].name)}</h1>", *_log(logs[0], "log1", drawn, alone=True), *_made()]
@@ -94,7 +94,7 @@ def drawings(logs: Sequence[RunData]) -> dict[str, str]:
         name: _svg(panel, picture.name, k)
         for number, data in enumerate(logs, start=1)
         for picture in _pictures(data)
-        if picture is not None and picture.name != EVENTS
+        if picture.name != EVENTS
         for k, panel in enumerate(picture.panels)
         for name in [f"log{number}-{picture.name}-{k}"]
     }
@@ -113,7 +113,7 @@ def write_pngs(data: RunData, folder: Path, *, overwrite: bool = False) -> list[
         ConfigError: matplotlib is not installed, or a file exists (without `overwrite`) or cannot be written.
     """
     require_matplotlib()
-    pictures = [picture for picture in _pictures(data) if picture is not None]
+    pictures = _pictures(data)
     paths = [folder / f"{file_name(data.name)}-{picture.name}.png" for picture in pictures]
     existing = [path for path in paths if path.exists()]
     if existing and not overwrite:  # before anything is drawn
@@ -146,14 +146,13 @@ def check_target(path: Location, *, overwrite: bool = False) -> None:
     Target(path, overwrite=overwrite).abandon()
 
 
-def _pictures(data: RunData) -> Iterator[Picture | None]:
-    for make in PICTURES:
-        yield make(data)
+def _pictures(data: RunData) -> list[Picture]:
+    return [picture for make in PICTURES if (picture := make(data)) is not None]
 
 
 def _log(data: RunData, key: str, drawn: Mapping[str, str], *, alone: bool) -> Iterator[str]:
     """Section of one log; among several logs its pictures are folded on screen."""
-    pictures = [picture for picture in _pictures(data) if picture is not None]
+    pictures = _pictures(data)
     yield f'<p class="conclusion">{text(conclusion(data))}</p>'
     yield cards(key_numbers(data))
     entries = {picture.name: picture.title for picture in pictures}

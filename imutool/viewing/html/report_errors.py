@@ -28,19 +28,20 @@ Line = Float64[np.ndarray, " _"]
 
 def error_curves(data: RunData) -> Picture | None:
     """Orientation and position error, total and by direction; None without truth."""
-    scored = [trace for trace in data.traces if trace.errors is not None]
-    if not scored:
+    with_errors = [(trace, trace.errors) for trace in data.traces if trace.errors is not None]
+    if not with_errors:
         return None
+    scored, errors = [trace for trace, _ in with_errors], [found for _, found in with_errors]
     turned = {
-        "total": [_of(trace).orientation_total_deg for trace in scored],
-        **{name: [_of(trace).roll_pitch_yaw_deg[:, k] for trace in scored] for k, name in enumerate(("roll", "pitch", "yaw"))},
+        "total": [found.orientation_total_deg for found in errors],
+        **{name: [found.roll_pitch_yaw_deg[:, k] for found in errors] for k, name in enumerate(("roll", "pitch", "yaw"))},
     }
     moved = {
-        "total": [_of(trace).position_total_m for trace in scored],
-        "horizontal": [_of(trace).horizontal_m for trace in scored],
-        "vertical": [_of(trace).vertical_m for trace in scored],
+        "total": [found.position_total_m for found in errors],
+        "horizontal": [found.horizontal_m for found in errors],
+        "vertical": [found.vertical_m for found in errors],
     }
-    times = [data.elapsed_s(_of(trace).t_ns) for trace in scored]
+    times = [data.elapsed_s(found.t_ns) for found in errors]
     panels: tuple[Panel, ...] = (_panel(data, scored, times, turned, "Orientation error", "°"),)
     if _positions_known(data):
         panels += (_panel(data, scored, times, moved, "Position error", "m"),)
@@ -78,11 +79,6 @@ def _largest(drift: Drift, t: Line, turned: Line, moved: Line) -> tuple[Decimate
     """Largest drift between two resets, at the first of them."""
     starts = _resets(drift)
     return t[starts], np.fmax.reduceat(turned, starts), np.fmax.reduceat(moved, starts)
-
-
-def _of(trace: Trace) -> Any:
-    assert trace.errors is not None, "only runs with errors come here"
-    return trace.errors
 
 
 def _panel(

@@ -119,7 +119,7 @@ def allan_deviation(data: RunData) -> Picture | None:
     for trace in data.traces:
         still = [trace.run.imu.between(int(imu.t_ns[a]), int(imu.t_ns[b - 1])) for a, b in ranges]
         for sensor in SENSORS:
-            curve = allan.curve([_both(part)[sensor] for part in still], imu.period_s)
+            curve = allan.curve([getattr(part, sensor) for part in still], imu.period_s)
             curves[sensor].append((trace, curve.tau_s, curve.deviation))
             recorded.setdefault(sensor, curve)
     panels = [
@@ -169,7 +169,7 @@ def _draw_samples(figure: Any, *, data: RunData, sensor: str, span_s: tuple[floa
     for rank, trace in enumerate(data.traces):
         t = data.elapsed_s(trace.run.imu.t_ns)
         part = slice(*np.searchsorted(t, span_s, side="left") + np.array([0, 1]))
-        values = _both(trace.run.imu)[sensor][part]
+        values = getattr(trace.run.imu, sensor)[part]
         if rank == 0 and len(data.traces) > 1:
             steps = _steps(values)
         style: dict[str, Any] = {"color": color_of(data, trace), "lw": 0.8}
@@ -281,7 +281,3 @@ def _decades(panels: Sequence[Any]) -> None:
         axes.set_yscale("log")
         decades(axes)
         plain_tick_labels(axes.xaxis, axes.yaxis)
-
-
-def _both(imu: Imu) -> dict[str, Vectors]:
-    return {"gyro": imu.gyro, "accel": imu.accel}

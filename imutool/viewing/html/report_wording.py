@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from imutool.viewing.model.run_data import RunData, Trace
+from imutool.viewing.model.trajectory_error import row_of_largest
 
 FIGURE_LABELS = {
     "aoe_deg": "Orientation error (AOE, °)",
@@ -70,9 +71,8 @@ def alignment_text(data: RunData) -> str:
 
 def worst_orientation_error(trace: Trace, data: RunData) -> tuple[float, float] | None:
     """Largest orientation error (deg) and its time (s from the start)."""
-    if trace.errors is None or not np.isfinite(trace.errors.orientation_total_deg).any():
+    if trace.errors is None or (row := row_of_largest(trace.errors.orientation_total_deg)) is None:
         return None
-    row = int(np.nanargmax(trace.errors.orientation_total_deg))
     at_s = data.elapsed_s(trace.errors.t_ns[row : row + 1])[0]
     return float(trace.errors.orientation_total_deg[row]), float(at_s)
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
 from imutool.cleaning import Survey
@@ -16,7 +15,7 @@ from imutool.diagnosis.result import SCHEMA
 from imutool.errors import ConfigError, DataError
 from imutool.inertial import stationary
 from imutool.recording import Imu, nanoseconds
-from imutool.viewing.model.trajectory_error import Errors
+from imutool.viewing.model.trajectory_error import Errors, row_of_largest
 
 Kind = Literal[
     "gap", "out_of_order", "clock_jump", "saturation", "spike", "stuck", "duplicate", "not_finite", "stop", "worst", "finding"
@@ -74,8 +73,7 @@ def worst_error_events(name: str, errors: Errors) -> Iterator[Event]:
     """Moments of a run's largest orientation and position error; none without errors."""
     of_kind = (("orientation", errors.orientation_total_deg, "deg"), ("position", errors.position_total_m, "m"))
     for kind, total, unit in of_kind:
-        if np.isfinite(total).any():
-            row = int(np.nanargmax(total))
+        if (row := row_of_largest(total)) is not None:
             at_ns = int(errors.t_ns[row])
             size = f"{total[row]:.3g}" if total[row] < EXPONENT_FROM else f"{total[row]:.0f}"
             yield Event("worst", at_ns, at_ns, f"{name}: largest {kind} error, {size} {unit}")

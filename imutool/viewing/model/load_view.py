@@ -21,7 +21,7 @@ from imutool.file_location import Location
 from imutool.inertial.aids import Aids, listed, parse_aids
 from imutool.inertial.metrics import evaluate
 from imutool.inertial.strapdown import StartPose, gaps_crossed, stretch_with_truth, with_velocity
-from imutool.recording import Imu, Poses, Recording, Scalars, seconds
+from imutool.recording import Poses, Recording, Scalars, seconds
 from imutool.viewing.model.events import Event, events_within, finding_events, stop_events, survey_events, worst_error_events
 from imutool.viewing.model.read_log import read_log
 from imutool.viewing.model.run_data import (
@@ -175,6 +175,10 @@ def build(
     worst = [
         event for trace in with_worst if trace.errors is not None for event in worst_error_events(trace.name, trace.errors)
     ]
+    if len(imu) > MAX_CURVE_ROWS:
+        of_paths.append(
+            f"Curves of {len(imu)} samples are drawn with at most {MAX_CURVE_ROWS} rows: the extremes of each stretch."
+        )
     shown, of_events = events_within([*events, *stop_events(imu), *worst], start_ns, end_ns)
     return RunData(
         name=recording.name,
@@ -183,7 +187,7 @@ def build(
         truth=None if truth is None else _within(truth, start_ns, end_ns),
         true_bias=_true_bias(recording),
         traces=traces,
-        notes=(*of_paths, *_decimation_note(imu), *notes, *of_events),
+        notes=(*of_paths, *notes, *of_events),
         alignment=align,
         events=shown,
     )
@@ -250,13 +254,6 @@ def _score(run: Run, known: TruthSpan, align: Alignment) -> tuple[Trace, str]:
 def _spectra(run: Run) -> Mapping[str, Spectrum]:
     """Spectra of the samples; an aided run has those of the run that it aids."""
     return {} if run.is_aided else spectra(run.imu)
-
-
-def _decimation_note(imu: Imu) -> list[str]:
-    """Note on a log too long to be drawn whole."""
-    if len(imu) <= MAX_CURVE_ROWS:
-        return []
-    return [f"Curves of {len(imu)} samples are drawn with at most {MAX_CURVE_ROWS} rows: the extremes of each stretch."]
 
 
 METADATA_PREFIX = "imutool"  # of the names of metadata records that imutool writes

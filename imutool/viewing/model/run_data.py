@@ -75,11 +75,7 @@ class Run:
 
     def aided(self, aids: Aids, prior: BiasPrior) -> Run:
         """The same samples, with a smoothed path by the aids of the log; `prior` is that of the bias that is left."""
-        return replace(self, name=f"{self.name} aided", path_from=partial(_aided_path, prior=prior, aids=aids))
-
-
-def _aided_path(imu: Imu, start: StartPose, prior: BiasPrior, aids: Aids) -> Poses:
-    return aided_path(imu, start, prior, aids)
+        return replace(self, name=f"{self.name} aided", path_from=partial(aided_path, prior=prior, aids=aids))
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ def alignment(name: str) -> Alignment:
     for known in ALIGNMENTS:
         if known == name:
             return known
-    raise ConfigError(f"{name!r}", where="align", expected=", ".join(ALIGNMENTS))
+    raise ConfigError(f"unknown alignment {name!r}", where="align", expected=", ".join(ALIGNMENTS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +87,11 @@ class Window:
     orientation_deg: float
     velocity_m_s: float
     position_m: float
+
+
+def row_of_largest(values: Float64[np.ndarray, " n"]) -> int | None:
+    """Row of the largest value; None where no value is finite."""
+    return int(np.nanargmax(values)) if np.isfinite(values).any() else None
 
 
 def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Errors:

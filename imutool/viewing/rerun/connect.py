@@ -14,8 +14,8 @@ from urllib.parse import SplitResult, urlsplit
 from imutool.errors import ConfigError
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun import scene, sdk
-from imutool.viewing.rerun.sdk import FLUSH_S, require_rerun, rerun_version, stream_of_logs
+from imutool.viewing.rerun import require_rerun, scene, sdk
+from imutool.viewing.rerun.sdk import FLUSH_S, new_stream, recording_name, rerun_version
 
 ANSWER_TIMEOUT_S = 0.6  # for a connection to open, for the first bytes of the listener, and for a viewer's version
 CURSOR_TIMEOUT_S = 1.5  # for a recording to arrive before its cursor can be set
@@ -55,7 +55,7 @@ def send(logs: Sequence[RunData], peer: Listener, *, source: bool = True, at_s: 
         ConfigError: the listener stopped.
     """
     _check_http2(peer.url)  # logs may have taken minutes to read
-    recording = stream_of_logs(logs)
+    recording = new_stream(recording_name(logs))
     recording.connect_grpc(peer.url)
     scene.send(logs, recording, source=source)
     try:
@@ -108,9 +108,9 @@ def full_url(url: str) -> str:
         parts = urlsplit(complete)
         port = parts.port  # refuses other than a number
     except ValueError as error:
-        raise ConfigError(f"{url!r} ({error})", where="connect", expected=expected) from error
+        raise ConfigError(f"{url!r} is no address ({error})", where="connect", expected=expected) from error
     if parts.scheme not in (PLAIN, *SECURE) or not parts.hostname or parts.path.rstrip("/") not in ("", PATH) or parts.query:
-        raise ConfigError(f"{url!r}", where="connect", expected=expected)
+        raise ConfigError(f"{url!r} is no address", where="connect", expected=expected)
     netloc = parts.netloc if port else f"{parts.netloc}:{DEFAULT_PORT}"
     return parts._replace(netloc=netloc, path=PATH).geturl()
 

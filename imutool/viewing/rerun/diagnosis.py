@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,18 +14,14 @@ from imutool.diagnosis.result import Diagnosis, Located, Traces
 from imutool.diagnosis.wording.conclusion import lines, location_text
 from imutool.mcap_io.storage.target import Target
 from imutool.recording import Times
-from imutool.units import AXES, UNITS
+from imutool.units import AXES, SENSORS, UNITS
 from imutool.viewing.html.diagnosis_figures import intervals_in_log
 from imutool.viewing.model.decimation import true_intervals
+from imutool.viewing.rerun import rr, rrb
 from imutool.viewing.rerun.entities import styles
-from imutool.viewing.rerun.entities.signals import KINDS
 from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, EVENT_COLOR, GREY, MODEL_COLORS, RAW_COLOR, RAW_WIDTH, Color
 from imutool.viewing.rerun.plots import frame, whole_time_axis
-from imutool.viewing.rerun.sdk import elapsed_column, entity_path, new_stream, require_rerun, rrd_bytes, unique_names
-
-if TYPE_CHECKING:
-    import rerun as rr
-    import rerun.blueprint as rrb
+from imutool.viewing.rerun.sdk import elapsed_column, entity_path, new_stream, rrd_bytes, unique_names
 
 TITLES = {"gyro": "Angular rate", "accel": "Specific force"}
 CURVES = ("real", "before", "after")  # columns of `samples`; `left` holds real minus before and real minus after
@@ -61,18 +57,12 @@ def log(d: Diagnosis, to: rr.RecordingStream) -> None:
     `/LOG/{gyro,accel}/{x,y,z}/samples` (real, before, after), `…/left` (real minus before, real minus after),
     `/LOG/events` (texts at the ends of located and unseen intervals), `/LOG/where/{SIGNAL}/{AXIS}` and
     `/LOG/where/unseen` (states `here` and `elsewhere`), `/report`. Two logs of one name get a number.
-
-    Raises:
-        ConfigError: Rerun is not installed.
     """
-    require_rerun()
-    import rerun as rr
-
     to.log("report", rr.TextDocument(_report(d), media_type="text/markdown"), static=True, strict=True)
     for name, trace in zip(names(d.traces), d.traces, strict=True):
         t_ns = _nanoseconds(trace.t_s)
         for column in range(6):
-            axis = (name, KINDS[column // 3], AXES[column % 3])
+            axis = (name, SENSORS[column // 3], AXES[column % 3])
             real, before, after = (values[:, column] for values in (trace.real, trace.before, trace.after))
             _log_curves(to, entity_path(axis, "samples"), t_ns, np.stack([real, before, after], axis=1), slice(0, 3))
             _log_curves(to, entity_path(axis, "left"), t_ns, np.stack([real - before, real - after], axis=1), slice(1, 3))
@@ -85,9 +75,6 @@ def blueprint(d: Diagnosis) -> rrb.Blueprint:
     Raises:
         ConfigError: Rerun is not installed.
     """
-    require_rerun()
-    import rerun.blueprint as rrb
-
     report = rrb.TextDocumentView(origin="/report", name="Report")
     tabs = [_log_tab(name, trace) for name, trace in zip(names(d.traces), d.traces, strict=True)]
     shown: Any = rrb.Horizontal(rrb.Tabs(*tabs, active_tab=0), report, column_shares=[3, 1]) if tabs else report
@@ -100,8 +87,6 @@ def names(traces: Sequence[Traces]) -> list[str]:
 
 
 def _log_tab(name: str, trace: Traces) -> rrb.Vertical:
-    import rerun.blueprint as rrb
-
     span_s = float(trace.t_s[0]), float(trace.t_s[-1])
 
     def view(kind: str, sensor: str, axis: str) -> rrb.TimeSeriesView:
@@ -113,7 +98,7 @@ def _log_tab(name: str, trace: Traces) -> rrb.Vertical:
         )
 
     curves = [
-        rrb.Horizontal(*(rrb.Vertical(*(view(kind, sensor, axis) for axis in AXES)) for sensor in KINDS), name=title)
+        rrb.Horizontal(*(rrb.Vertical(*(view(kind, sensor, axis) for axis in AXES)) for sensor in SENSORS), name=title)
         for kind, title in (("left", "Residuals"), ("samples", "Samples"))
     ]
     lanes = rrb.StateTimelineView(
@@ -125,8 +110,6 @@ def _log_tab(name: str, trace: Traces) -> rrb.Vertical:
 
 def _log_curves(to: rr.RecordingStream, entity: str, t_ns: Times, values: Float64[np.ndarray, "n k"], which: slice) -> None:
     """One curve per column after its style, so that the viewer chooses no colour."""
-    import rerun as rr
-
     to.log(entity, styles.line_style(CURVES[which], COLORS[which], WIDTHS[which]), static=True, strict=True)
     # strict: Rerun only warns of a length that does not match, and then the rows are missing
     to.send_columns(entity, [elapsed_column(t_ns)], rr.Scalars.columns(scalars=values), strict=True)
@@ -134,8 +117,6 @@ def _log_curves(to: rr.RecordingStream, entity: str, t_ns: Times, values: Float6
 
 def _log_intervals(to: rr.RecordingStream, d: Diagnosis, name: str, trace: Traces) -> None:
     """Located and unseen intervals as texts at their ends, and as states."""
-    import rerun as rr
-
     unseen = true_intervals(trace.t_s, trace.held_out)
     texts = [(t_s, "INFO", words) for ends in unseen for t_s, words in zip(ends, UNSEEN_TEXTS, strict=True)]
     inside: dict[tuple[str, ...], list[tuple[float, float]]] = {("unseen",): unseen}

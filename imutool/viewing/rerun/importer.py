@@ -10,27 +10,18 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from imutool.file_location import Location, first_bytes
+from imutool.viewing.rerun import rr
 
 if TYPE_CHECKING:
-    import rerun as rr
-
     from imutool.mcap_io.log import Log
     from imutool.viewing.model.run_data import RunData
 
 INCOMPATIBLE = 66  # exit code by which Rerun knows that a file is not this importer's
 MAGIC = b"\x89MCAP0\r\n"  # a log begins with it, whatever its name
 METADATA = "imutool"  # record with the sensor of a converted log
-
-
-class Target(NamedTuple):
-    """Recording that Rerun proposes: its application, its id, and the entity below which to log."""
-
-    application: str | None = None
-    recording: str | None = None
-    prefix: str = ""
 
 
 def main() -> NoReturn:
@@ -49,7 +40,7 @@ def main() -> NoReturn:
     from imutool.errors import ImutoolError
 
     try:
-        content = rrd(given.file, Target(given.application_id, given.recording_id, given.entity_path_prefix))
+        content = rrd(given.file, given.application_id, given.recording_id, given.entity_path_prefix)
     except ImutoolError as error:
         print(f"imutool: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
@@ -59,8 +50,10 @@ def main() -> NoReturn:
     sys.exit(0)
 
 
-def rrd(path: Path, target: Target | None = None) -> bytes | None:
-    """Content of the .rrd for a log, for the recording that Rerun proposes; None without an IMU.
+def rrd(path: Path, application: str | None = None, recording: str | None = None, prefix: str = "") -> bytes | None:
+    """Content of the .rrd for a log; None without an IMU.
+
+    Rerun proposes the ids of the application and of the recording, and the entity below which to log.
 
     The log's own debiased channels are shown; without any, the model that ships for its sensor is applied, else raw is alone.
 
@@ -73,14 +66,13 @@ def rrd(path: Path, target: Target | None = None) -> bytes | None:
         return None
     from imutool.viewing.rerun import layout, scene, sdk
 
-    target = target or Target()
-    root = tuple(part for part in target.prefix.split("/") if part)
+    root = tuple(part for part in prefix.split("/") if part)
 
-    def send(recording: rr.RecordingStream) -> None:
-        recording.send_blueprint(layout.blueprint([data], root=root))
-        scene.log([data], recording, root=root)
+    def send(stream: rr.RecordingStream) -> None:
+        stream.send_blueprint(layout.blueprint([data], root=root))
+        scene.log([data], stream, root=root)
 
-    return sdk.rrd_bytes(sdk.new_stream(data.name, application=target.application, recording=target.recording), send)
+    return sdk.rrd_bytes(sdk.new_stream(data.name, application=application, recording=recording), send)
 
 
 def _is_mcap(path: Path) -> bool:

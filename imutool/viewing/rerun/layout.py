@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from imutool.viewing.model.run_data import RunData, Trace
-from imutool.viewing.rerun import plots, tabs
+from imutool.viewing.rerun import plots, rr, rrb, tabs
 from imutool.viewing.rerun.entities import errors, styles
 from imutool.viewing.rerun.entities.paths import LEGEND_X, LEGEND_Y, error_rows, error_scale_top
 from imutool.viewing.rerun.entities.styles import BACKGROUND, MODEL_COLORS, RAW_FADE, Color, blend_to_grey
 from imutool.viewing.rerun.plots import Box, plot
-from imutool.viewing.rerun.sdk import Scope, entity_path, label, require_rerun, role, scopes, trace_path
-
-if TYPE_CHECKING:
-    import rerun as rr
-    import rerun.blueprint as rrb
+from imutool.viewing.rerun.sdk import Scope, entity_path, label, role, scopes, trace_path
 
 ROW_SHARES = {"paths": 6.0, "legend": 0.9, "error": 2.6}
 LIVE_WINDOW_S = 20.0  # of the plots in a live view
@@ -32,9 +28,6 @@ def blueprint(logs: Sequence[RunData], *, source: bool = True, root: Scope = ())
     Raises:
         ConfigError: Rerun is not installed.
     """
-    require_rerun()
-    import rerun.blueprint as rrb
-
     of_logs = scopes(logs, root)
     views = [_log_view(data, scope, source) for data, scope in zip(logs, of_logs, strict=True)]
     return plots.frame(views[0] if len(logs) == 1 else rrb.Tabs(_comparison(logs, of_logs), *views, active_tab=0))
@@ -47,16 +40,12 @@ def live_blueprint(scopes: Mapping[str, Scope], boxes: Mapping[str, Box] | None 
         scopes: the scope of each IMU topic.
         boxes: the extent of each debiased path once it is complete; without them plots follow the last seconds.
     """
-    import rerun.blueprint as rrb
-
     views = [_live_view(topic, scope, None if boxes is None else boxes[topic]) for topic, scope in scopes.items()]
     return plots.frame(views[0] if len(views) == 1 else rrb.Tabs(*views, active_tab=0))
 
 
 def fleet_blueprint() -> rrb.Blueprint:
     """Layout for any log of a fleet: paths and errors, and tabs of all else."""
-    import rerun.blueprint as rrb
-
     paths = rrb.Spatial3DView(
         origin="/world",
         contents=["/world/gt/**", "/world/debiased/**"],  # raw leaves for kilometres
@@ -94,8 +83,6 @@ def fleet_blueprint() -> rrb.Blueprint:
 
 def _log_view(data: RunData, scope: Scope, source: bool) -> rrb.Horizontal:
     """One log: paths and total errors on the left, tabs on the right."""
-    import rerun.blueprint as rrb
-
     left: list[Any] = [paths_view(data, scope)]
     shares = [ROW_SHARES["paths"]]
     if error_scale_top(data) is not None:
@@ -115,8 +102,6 @@ def paths_view(data: RunData, scope: Scope) -> rrb.Spatial3DView:
 
     The camera looks at the truth, without truth at all paths: raw paths often leave for kilometres.
     """
-    import rerun.blueprint as rrb
-
     entities = [trace_path(data, trace, scope, "world", role(trace)) for trace in data.traces]
     entities += [entity_path(scope, "world", "gt")] if data.truth is not None else []
     vectors = _error_vectors(data, scope)
@@ -133,8 +118,6 @@ def paths_view(data: RunData, scope: Scope) -> rrb.Spatial3DView:
 
 def _error_vectors(data: RunData, scope: Scope) -> Mapping[rr.EntityPath | str, rrb.VisibleTimeRanges]:
     """Entity of each model's error vectors, of which only the one at the cursor is visible."""
-    import rerun.blueprint as rrb
-
     vectors: dict[rr.EntityPath | str, rrb.VisibleTimeRanges] = {}
     for trace in data.models():
         if trace.errors is not None and len(rows := error_rows(trace, trace.errors)) > 1:
@@ -146,8 +129,6 @@ def _error_vectors(data: RunData, scope: Scope) -> Mapping[rr.EntityPath | str, 
 
 def _legend(scope: Scope) -> rrb.Spatial2DView:
     """Colour scale of the debiased path."""
-    import rerun.blueprint as rrb
-
     return rrb.Spatial2DView(
         origin=entity_path(scope, "legend"),
         name="Orientation error of the debiased path",
@@ -159,10 +140,9 @@ def _legend(scope: Scope) -> rrb.Spatial2DView:
 
 def _comparison(logs: Sequence[RunData], scopes: Sequence[Scope]) -> rrb.Vertical:
     """Errors of all logs over elapsed time, above a table of their figures."""
-    import rerun.blueprint as rrb
-
     rows: list[Any] = []
-    scored = _runs_with_errors(logs, scopes)
+    with_scope = zip(logs, scopes, strict=True)
+    scored = [(data, trace, scope) for data, scope in with_scope for trace in data.traces if trace.errors is not None]
     for kind in errors.KINDS:
         overrides = {}
         for (data, trace, scope), color in zip(scored, _comparison_colors(scored), strict=True):
@@ -174,15 +154,6 @@ def _comparison(logs: Sequence[RunData], scopes: Sequence[Scope]) -> rrb.Vertica
             rows.append(plot(list(overrides), title, height=(0.0, limit) if limit else None, overrides=overrides))
     figures = rrb.TextDocumentView(origin="/compare", name="Figures")
     return rrb.Vertical(*([rrb.Horizontal(*rows)] if rows else []), figures, name="Compare")
-
-
-def _runs_with_errors(logs: Sequence[RunData], scopes: Sequence[Scope]) -> list[tuple[RunData, Trace, Scope]]:
-    return [
-        (data, trace, scope)
-        for data, scope in zip(logs, scopes, strict=True)
-        for trace in data.traces
-        if trace.errors is not None
-    ]
 
 
 def _comparison_colors(scored: Sequence[tuple[RunData, Trace, Scope]]) -> list[Color]:
@@ -209,8 +180,6 @@ def scene_box(data: RunData) -> Box:
 
 def _live_view(topic: str, scope: Scope, box: Box | None) -> rrb.Horizontal:
     """Paths, signals and biases of one IMU; the camera follows the body until the box is known."""
-    import rerun.blueprint as rrb
-
     body = entity_path(scope, "world", "debiased", "body")
     paths = rrb.Spatial3DView(
         origin=entity_path(scope, "world"),
@@ -229,8 +198,6 @@ def _live_view(topic: str, scope: Scope, box: Box | None) -> rrb.Horizontal:
 
 
 def _live_plot(scope: Scope, of: tuple[str, str], names: tuple[str, ...], title: str, live: bool) -> rrb.TimeSeriesView:
-    import rerun.blueprint as rrb
-
     contents = [entity_path(scope, *of, name) for name in names]
     if not live:
         return plot(contents, title, legend=False)

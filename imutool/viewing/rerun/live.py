@@ -11,7 +11,6 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,18 +19,16 @@ from imutool.errors import ConfigError, ImutoolError
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.mcap_io.storage.target import Target
 from imutool.recording import Imu, Poses
+from imutool.units import SENSORS
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import level_start
-from imutool.viewing.rerun import connect, layout, sdk, viewer
+from imutool.viewing.rerun import connect, layout, rr, sdk, viewer
 from imutool.viewing.rerun.connect import Listener
 from imutool.viewing.rerun.entities import paths, styles
-from imutool.viewing.rerun.entities.signals import KINDS, SIGMAS
+from imutool.viewing.rerun.entities.signals import SIGMAS
 from imutool.viewing.rerun.entities.styles import MODEL_COLORS, RAW_COLOR
 from imutool.viewing.rerun.plots import Box
-from imutool.viewing.rerun.sdk import FLUSH_S, Role, Scope, new_stream, require_rerun
-
-if TYPE_CHECKING:
-    import rerun as rr
+from imutool.viewing.rerun.sdk import FLUSH_S, Role, Scope, new_stream
 
 FLUSH_BATCH_S = 0.05  # for a batch to be sent
 STALLED_S = 5.0  # without a sent batch: the viewer does not keep up, and waiting batches fill our memory
@@ -56,7 +53,6 @@ def live_view(
         ConfigError: Rerun is not installed, nothing listens at `connect_to`, or the file exists (without `overwrite`) or
             cannot be written.
     """
-    require_rerun()
     layout.live_blueprint({name: ()})  # the first layout takes 0.3 s, in which a stream of samples would have to wait
     live = Live(name)
     if connect_to is not None:
@@ -64,7 +60,7 @@ def live_view(
         live.send(peer, Output("connect", peer.url, f"Shown live: {peer.url}{connect.version_mismatch(peer)}."))
     elif save is None:
         try:
-            peer = viewer.open_empty()
+            peer = viewer.start().peer
             live.send(peer, Output("viewer", peer.url, "The viewer is open and showed the debiasing live."))
         except ConfigError as error:
             save, live.trouble = instead, viewer.as_sentence(error)
@@ -109,7 +105,7 @@ class Live:
         self.shown.append(shown)
 
     def record(self, path: Path, temporary: Path) -> None:
-        """Also write everything to `temporary`, which will become `path`."""
+        """Write everything to `temporary` too, which will become `path`."""
         self._file = new_stream(self._name)
         self._file.save(temporary)
         self.shown.append(Output("rrd", str(path), f"{self.trouble}Saved {path}. Open with: rerun {path}"))
@@ -195,8 +191,6 @@ class _Imu:
 
     def begin(self, to: rr.RecordingStream) -> None:
         """Log styles before any data."""
-        import rerun as rr
-
         colors = {"raw": RAW_COLOR, "debiased": MODEL_COLORS[0]}
         to.log(self._path("world"), rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
         for role, color in colors.items():
@@ -204,7 +198,7 @@ class _Imu:
             to.log(
                 self._path("world", role, "body"), *styles.body_style(role, role, color, SCENE_SIZE_M), static=True, strict=True
             )
-        for kind in KINDS:
+        for kind in SENSORS:
             for role in self._paths:
                 to.log(
                     self._path("imu", kind, role), styles.axis_curves(role, styles.axis_names(role)), static=True, strict=True
@@ -223,13 +217,11 @@ class _Imu:
         if not new.any():
             return
         self._last_ns = int(block.batch.stamp_ns[-1])
-        import rerun as rr
-
         t_ns, log_ns = block.batch.stamp_ns[new], block.batch.log_time[new]
         raw = np.hstack([block.batch.gyro, block.batch.accel])[new]
         bias, margin = block.bias[new], SIGMAS * block.std[new]
         curves: dict[str, np.ndarray] = {}
-        for kind, columns in zip(KINDS, COLUMNS, strict=True):
+        for kind, columns in zip(SENSORS, COLUMNS, strict=True):
             curves[self._path("imu", kind, "raw")] = raw[:, columns]
             curves[self._path("imu", kind, "debiased")] = (raw - bias)[:, columns]
             curves[self._path("bias", kind, "estimated")] = bias[:, columns]
@@ -249,8 +241,6 @@ class _Imu:
         )  # of the debiased path, which comes last
 
     def _log_path(self, entity: str, poses: Poses, delay_ns: int, streams: list[rr.RecordingStream]) -> None:
-        import rerun as rr
-
         cut = paths.path_pieces(poses)
         if not len(cut.first):
             return

@@ -14,14 +14,13 @@ import numpy as np
 from imutool.errors import LogError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
-from imutool.mcap_io.topics import DERIVED_KEY, Topic
+from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.recording import Times
 from imutool.viewing.model.run_data import TRUE_BIAS, RunData
-from imutool.viewing.rerun import sdk
+from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.sdk import Scope, entity_path
 
 if TYPE_CHECKING:
-    import rerun as rr
     from rerun.chunk import Chunk
 
 logger = logging.getLogger(__name__)
@@ -64,7 +63,8 @@ def plan_import(data: RunData, scope: Scope) -> ImportPlan:
     if scope and (frames := tuple(topic.name for topic in topics if topic.schema_name in (schemas.TF, schemas.TRANSFORM))):
         left_out += frames  # a viewer has one set of frames, and both logs would move the same ones
         sentence = f"Its transforms ({', '.join(frames)}) are not shown: the other logs may name the same frames."
-    cameras = tuple(_camera(topic, data, scope) for topic in topics if topic.schema_name == schemas.IMAGE and topic.count)
+    names = [topic.name.split("/") for topic in topics if topic.schema_name == schemas.IMAGE and topic.count]
+    cameras = tuple(_entity_of_topic(entity_path((), *filter(None, parts)), data, scope) for parts in names)
     return ImportPlan(True, left_out, cameras, sentence)
 
 
@@ -88,10 +88,6 @@ def log(data: RunData, to: rr.RecordingStream, scope: Scope) -> list[str]:
         logger.debug("%s", error, exc_info=True)
         return [*notes, f"{NOT_SHOWN}: Rerun cannot read them ({error})."]
     return notes
-
-
-def _camera(topic: Topic, data: RunData, scope: Scope) -> str:
-    return _entity_of_topic(entity_path((), *(part for part in topic.name.split("/") if part)), data, scope)
 
 
 def _entity_of_topic(entity: str, data: RunData, scope: Scope) -> str:

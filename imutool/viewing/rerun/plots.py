@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from imutool.array_types import Float64
 from imutool.viewing.model.run_data import RunData, round_up_125
+from imutool.viewing.rerun import rr, rrb
 from imutool.viewing.rerun.sdk import ELAPSED, TIMELINES
-
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
 
 Box = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]  # lowest and highest corner, m
 
@@ -28,8 +26,6 @@ def frame(
     recordings: Literal["collapsed", "expanded"] = "collapsed",
 ) -> rrb.Blueprint:
     """Blueprint around views: `elapsed` as the timeline, side panels collapsed."""
-    import rerun.blueprint as rrb
-
     return rrb.Blueprint(
         content,
         rrb.BlueprintPanel(state=recordings),
@@ -53,8 +49,6 @@ def plot(
 
     A legend always covers some curves. Unless `legend` decides, it appears only where the title is too short for the key.
     """
-    import rerun.blueprint as rrb
-
     name = f"{title}: {key}" if key else title
     in_title = bool(key) and len(name) <= MAX_TITLE_LENGTH
     return rrb.TimeSeriesView(
@@ -70,9 +64,6 @@ def plot(
 
 def whole_time_axis(span_s: tuple[float, float] | None = None) -> rrb.TimeAxis:
     """Time axis over the whole timeline or a span; Rerun's default shows one minute."""
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     boundary = rr.TimeRangeBoundary
     ends = [boundary.infinite()] * 2 if span_s is None else [boundary.absolute(seconds=t_s) for t_s in span_s]
     return rrb.TimeAxis(link="Independent", view_range=rr.TimeRange(start=ends[0], end=ends[1]))
@@ -80,9 +71,6 @@ def whole_time_axis(span_s: tuple[float, float] | None = None) -> rrb.TimeAxis:
 
 def visible_until_cursor(last_s: float | None = None) -> list[rrb.VisibleTimeRange]:
     """Visible time ranges up to the cursor: from the start, or only the last seconds."""
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     boundary = rr.TimeRangeBoundary
     start = boundary.infinite() if last_s is None else boundary.cursor_relative(seconds=-last_s)
     return [rrb.VisibleTimeRange(timeline, start=start, end=boundary.cursor_relative()) for timeline in TIMELINES]
@@ -90,8 +78,6 @@ def visible_until_cursor(last_s: float | None = None) -> list[rrb.VisibleTimeRan
 
 def camera_on(box: Box) -> rrb.EyeControls3D:
     """Camera that looks at a box from above one of its corners."""
-    import rerun.blueprint as rrb
-
     low, high = box
     centre = (low + high) / 2.0
     return rrb.EyeControls3D(position=centre + diagonal_m(box) * CAMERA_OFFSET, look_target=centre, eye_up=(0.0, 0.0, 1.0))
@@ -115,11 +101,6 @@ def error_axis_limit(data: RunData, values: Mapping[str, np.ndarray]) -> float |
     return limit if limit > 0.0 else None
 
 
-def unsigned_range(limit: float | None) -> tuple[float, float] | None:
-    """Axis range of unsigned errors."""
-    return None if limit is None else (0.0, limit)
-
-
-def signed_range(limit: float | None) -> tuple[float, float] | None:
-    """Axis range of signed errors."""
-    return None if limit is None else (-limit, limit)
+def error_range(limit: float | None, *, signed: bool = False) -> tuple[float, float] | None:
+    """Axis range of errors up to a limit."""
+    return None if limit is None else (-limit if signed else 0.0, limit)

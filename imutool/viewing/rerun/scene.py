@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.storage.target import Target
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun import layout, other_topics
+from imutool.viewing.rerun import layout, other_topics, require_rerun, rr
 from imutool.viewing.rerun.entities import errors, paths, report, signals
 from imutool.viewing.rerun.plots import diagonal_m
-from imutool.viewing.rerun.sdk import Scope, recording_name, require_rerun, rrd_bytes, scopes, stream_of_logs
-
-if TYPE_CHECKING:
-    import rerun as rr
+from imutool.viewing.rerun.sdk import Scope, new_stream, recording_name, rrd_bytes, scopes
 
 
 def log(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True, root: Scope = ()) -> None:
@@ -26,11 +22,7 @@ def log(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True,
     `world/{gt,raw,debiased}/{path,body}`, `imu/{gyro,accel}/{raw,debiased}`, `bias/{gyro,accel}/{estimated,true,sigma}`,
     `error/{orientation,position}/{raw,debiased}` (degrees and metres; parts below), `error/drift/…`,
     `spectrum/{gyro,accel}/…`, `events/KIND`, `report`; with `source` the log's other topics under their own names.
-
-    Raises:
-        ConfigError: Rerun is not installed.
     """
-    require_rerun()
     to.set_log_time_enabled(False)
     to.set_log_tick_enabled(False)
     if len(logs) > 1:  # first: the user sees it first, and a page receives slowly
@@ -67,7 +59,7 @@ def rrd(logs: Sequence[RunData], *, source: bool = True) -> bytes:
     Raises:
         ConfigError: no log, or Rerun is not installed.
     """
-    return rrd_bytes(stream_of_logs(logs), lambda recording: send(logs, recording, source=source))
+    return rrd_bytes(new_stream(recording_name(logs)), lambda recording: send(logs, recording, source=source))
 
 
 def _log_one(data: RunData, to: rr.RecordingStream, scope: Scope, with_source: bool) -> None:

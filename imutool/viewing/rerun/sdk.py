@@ -2,53 +2,23 @@
 
 from __future__ import annotations
 
-import os
 import re
 import uuid
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from imutool.errors import ConfigError, required
+from imutool.errors import ConfigError
 from imutool.recording import Times
 from imutool.viewing.model.run_data import RunData, Trace
-
-if TYPE_CHECKING:
-    import rerun as rr
+from imutool.viewing.rerun import rr
 
 Role = Literal["raw", "debiased"]
 Scope = tuple[str, ...]  # leading parts of the entity paths of one log; empty for the root
 
 FLUSH_S = 30.0
-LOGGING = "RUST_LOG"
-LOG_LEVELS = "warn,re_grpc_client=off,re_sdk=off,re_log_encoding=off"  # drops Rerun's lines that repeat our own messages
 
 # Rerun's MCAP reader gives the last two names to header stamps and log times, so that the log's other topics line up.
 ELAPSED, STAMP, LOG_TIME = TIMELINES = ("elapsed", "ros2_timestamp", "message_log_time")
-
-
-def require_rerun() -> None:
-    """Check that Rerun can be imported.
-
-    Raises:
-        ConfigError: Rerun is not installed.
-    """
-    if LOGGING in os.environ:
-        required("rerun", "view", package="the viewer", where="view")
-        return
-    os.environ[LOGGING] = LOG_LEVELS  # read when Rerun is first imported, and not for other programs of the caller
-    try:
-        required("rerun", "view", package="the viewer", where="view")
-    finally:
-        os.environ.pop(LOGGING, None)
-
-
-def stream_of_logs(logs: Sequence[RunData]) -> rr.RecordingStream:
-    """Create a recording stream named after some logs.
-
-    Raises:
-        ConfigError: no log, or Rerun is not installed.
-    """
-    return new_stream(recording_name(logs))
 
 
 def new_stream(name: str, *, application: str | None = None, recording: str | None = None) -> rr.RecordingStream:
@@ -61,9 +31,6 @@ def new_stream(name: str, *, application: str | None = None, recording: str | No
     Raises:
         ConfigError: Rerun is not installed.
     """
-    require_rerun()
-    import rerun as rr
-
     short = safe_name(name)
     stream = rr.RecordingStream(application or f"imutool {short}", recording_id=recording or f"{short}-{uuid.uuid4().hex[:8]}")
     stream.set_log_time_enabled(False)
@@ -73,8 +40,6 @@ def new_stream(name: str, *, application: str | None = None, recording: str | No
 
 def rrd_bytes(recording: rr.RecordingStream, send: Callable[[rr.RecordingStream], None]) -> bytes:
     """Content of an .rrd file with what `send` logs into a recording."""
-    import rerun as rr
-
     written = rr.binary_stream(recording)
     send(recording)
     content = written.read(flush_timeout_sec=FLUSH_S)
@@ -101,8 +66,6 @@ def safe_name(name: str) -> str:
 
 def rerun_version() -> str:
     """Version of the installed Rerun SDK and of the viewer that ships with it."""
-    import rerun as rr
-
     return str(rr.__version__)
 
 
@@ -145,8 +108,6 @@ def _common_prefix_length(names: Sequence[str]) -> int:
 
 def entity_path(scope: Scope, *parts: str) -> str:
     """Entity path from the root; each part may hold any character."""
-    import rerun as rr
-
     return f"/{str(rr.new_entity_path([*scope, *parts])).removeprefix('/')}"
 
 
@@ -159,8 +120,6 @@ def trace_path(data: RunData, trace: Trace, scope: Scope, *parts: str) -> str:
 
 def time_columns(stamp_ns: Times, log_ns: Times, start_ns: int) -> list[rr.TimeColumn]:
     """Time columns in nanoseconds: time since the first IMU sample, header stamp, log time."""
-    import rerun as rr
-
     return [
         elapsed_column(stamp_ns - start_ns),
         rr.TimeColumn(STAMP, timestamp=stamp_ns.astype("datetime64[ns]")),
@@ -170,8 +129,6 @@ def time_columns(stamp_ns: Times, log_ns: Times, start_ns: int) -> list[rr.TimeC
 
 def elapsed_column(elapsed_ns: Times) -> rr.TimeColumn:
     """Time column of nanoseconds since the start."""
-    import rerun as rr
-
     return rr.TimeColumn(ELAPSED, duration=elapsed_ns.astype("timedelta64[ns]"))
 
 

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from imutool.units import AXES, UNITS
+from imutool.units import AXES, SENSORS, UNITS
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift, Errors
-from imutool.viewing.rerun import other_topics, sdk
+from imutool.viewing.rerun import other_topics, rr, rrb, sdk
 from imutool.viewing.rerun.entities import errors, signals
 from imutool.viewing.rerun.entities.styles import BACKGROUND, color_name, color_of
-from imutool.viewing.rerun.plots import error_axis_limit, plot, signed_range, unsigned_range, whole_time_axis
+from imutool.viewing.rerun.plots import error_axis_limit, error_range, plot, whole_time_axis
 from imutool.viewing.rerun.sdk import Scope
-
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
 
 TITLES = {"gyro": "Angular rate (rad/s)", "accel": "Specific force (m/s²)"}
 BIAS_TITLES = {"gyro": "Gyro bias (rad/s)", "accel": "Accel bias (m/s²)"}
@@ -35,7 +32,8 @@ def tabs(data: RunData, scope: Scope, with_source: bool) -> list[View]:
     samples = data.integrated()
     views = [_signals(samples, scope), _bias(samples, scope), _spectrum(samples, scope), _errors(data, scope)]
     views.append(_events(data, scope))
-    return [view for view in (*views, _report(scope), _cameras(data, scope) if with_source else None) if view is not None]
+    report = rrb.TextDocumentView(origin=sdk.entity_path(scope, "report"), name="Report")
+    return [view for view in (*views, report, _cameras(data, scope) if with_source else None) if view is not None]
 
 
 def total_errors(data: RunData, scope: Scope) -> list[View]:
@@ -50,7 +48,7 @@ def total_errors(data: RunData, scope: Scope) -> list[View]:
             top = "" if limit is None else f", top {limit:.3g}"  # a low plot may have no room for tick labels
             title, key = f"{kind.capitalize()} error ({errors.UNITS[kind]}){top}", _colors(data, _models_first(data))
             key += ", worst pink" if any(not trace.is_raw for trace in scored) else ""
-            views.append(plot(contents, title, key, height=unsigned_range(limit)))
+            views.append(plot(contents, title, key, height=error_range(limit)))
     return views
 
 
@@ -69,17 +67,13 @@ def error_limit(data: RunData, kind: str) -> float | None:
 
 
 def _signals(data: RunData, scope: Scope) -> View:
-    import rerun.blueprint as rrb
-
     shown = [_three(data, _of_all(data, scope, "imu", kind), title) for kind, title in TITLES.items()]
     return rrb.Vertical(*shown, name="Signals")
 
 
 def _bias(data: RunData, scope: Scope) -> View | None:
     """Bias tabs per sensor, a plot per axis: one plot would hide differences of a thousandth."""
-    import rerun.blueprint as rrb
-
-    sensors = [kind for kind in signals.KINDS if data.models() or kind in data.true_bias]
+    sensors = [kind for kind in SENSORS if data.models() or kind in data.true_bias]
     if not sensors:
         return None
     views = [
@@ -90,8 +84,6 @@ def _bias(data: RunData, scope: Scope) -> View | None:
 
 def _bias_of(data: RunData, scope: Scope, kind: str, axis: int) -> rrb.TimeSeriesView:
     """Plot of one axis of one sensor; each of several models has its colour of the error plots."""
-    import rerun as rr
-
     overrides: dict[str, Any] = {}
     several = len(data.models()) > 1
     key_parts = []
@@ -140,8 +132,6 @@ def _bias_range(data: RunData, kind: str, axis: int) -> tuple[float, float] | No
 
 
 def _spectrum(data: RunData, scope: Scope) -> View | None:
-    import rerun.blueprint as rrb
-
     bounds = rrb.VisualBounds2D(x_range=signals.VISIBLE_X, y_range=signals.VISIBLE_Y)
     shown = []
     for kind in signals.sensors_with_spectrum(data):
@@ -154,8 +144,6 @@ def _spectrum(data: RunData, scope: Scope) -> View | None:
 
 def _errors(data: RunData, scope: Scope) -> View | None:
     """Errors by axis, by angle or direction, and since the last reset; one tab per kind."""
-    import rerun.blueprint as rrb
-
     if all(trace.errors is None for trace in data.traces):
         return None
     return rrb.Tabs(
@@ -167,23 +155,21 @@ def _errors(data: RunData, scope: Scope) -> View | None:
 
 
 def _orientation(data: RunData, scope: Scope) -> list[View]:
-    by_axis = error_axis_limit(data, _by_run(data, lambda found: found.orientation_deg))
-    by_angle = error_axis_limit(data, _by_run(data, lambda found: found.roll_pitch_yaw_deg))
+    by_axis = error_range(error_axis_limit(data, _by_run(data, lambda found: found.orientation_deg)), signed=True)
+    by_angle = error_range(error_axis_limit(data, _by_run(data, lambda found: found.roll_pitch_yaw_deg)), signed=True)
     return [
-        _three(data, _of_scored(data, scope, "orientation", "axes"), "About the body's axes (deg)", signed_range(by_axis)),
-        _three(
-            data, _of_scored(data, scope, "orientation", "rpy"), "Roll, pitch, yaw (deg)", signed_range(by_angle), errors.ANGLES
-        ),
+        _three(data, _of_scored(data, scope, "orientation", "axes"), "About the body's axes (deg)", by_axis),
+        _three(data, _of_scored(data, scope, "orientation", "rpy"), "Roll, pitch, yaw (deg)", by_angle, errors.ANGLES),
         *_drift(data, scope, "orientation", lambda drift: drift.orientation_deg),
     ]
 
 
 def _position(data: RunData, scope: Scope) -> list[View]:
-    by_axis = error_axis_limit(data, _by_run(data, lambda found: found.position_m))
+    by_axis = error_range(error_axis_limit(data, _by_run(data, lambda found: found.position_m)), signed=True)
     contents = [*_of_scored(data, scope, "position", "horizontal"), *_of_scored(data, scope, "position", "vertical")]
-    limits = signed_range(error_limit(data, "position"))
+    limits = error_range(error_limit(data, "position"), signed=True)
     return [
-        _three(data, _of_scored(data, scope, "position", "axes"), "Along the world's axes (m)", signed_range(by_axis)),
+        _three(data, _of_scored(data, scope, "position", "axes"), "Along the world's axes (m)", by_axis),
         plot(contents, "Horizontal (length) and vertical (m)", height=limits),
         *_drift(data, scope, "position", lambda drift: drift.position_m),
     ]
@@ -203,41 +189,23 @@ def _drift(data: RunData, scope: Scope, kind: str, of: Callable[[Drift], np.ndar
             contents,
             title,
             key,
-            height=unsigned_range(error_axis_limit(data, {name: of(drift) for name, drift in drifts.items()})),
+            height=error_range(error_axis_limit(data, {name: of(drift) for name, drift in drifts.items()})),
         )
     ]
 
 
 def _events(data: RunData, scope: Scope) -> View | None:
-    import rerun.blueprint as rrb
-
     kinds = errors.event_kinds(data)
     if not kinds:
         return None
-    contents = [sdk.entity_path(scope, "events", kind) for kind in kinds]
-    lanes = rrb.StateTimelineView(
-        origin=sdk.entity_path(scope, "events"), contents=contents, name="When", time_view=whole_time_axis()
-    )
-    return rrb.Vertical(lanes, _event_list(contents, sdk.entity_path(scope, "events")), name="Events", row_shares=[1, 1])
-
-
-def _event_list(contents: list[str], origin: str) -> rrb.TextLogView:
-    """List of events; a click on a time moves the cursor there."""
-    import rerun.blueprint as rrb
-
+    origin, contents = sdk.entity_path(scope, "events"), [sdk.entity_path(scope, "events", kind) for kind in kinds]
+    lanes = rrb.StateTimelineView(origin=origin, contents=contents, name="When", time_view=whole_time_axis())
     columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
-    return rrb.TextLogView(origin=origin, contents=contents, name="What", columns=columns)
-
-
-def _report(scope: Scope) -> View:
-    import rerun.blueprint as rrb
-
-    return rrb.TextDocumentView(origin=sdk.entity_path(scope, "report"), name="Report")
+    texts = rrb.TextLogView(origin=origin, contents=contents, name="What", columns=columns)  # a click moves the cursor there
+    return rrb.Vertical(lanes, texts, name="Events", row_shares=[1, 1])
 
 
 def _cameras(data: RunData, scope: Scope) -> View | None:
-    import rerun.blueprint as rrb
-
     cameras = other_topics.plan_import(data, scope).cameras
     shown = [rrb.Spatial2DView(origin=camera, name=camera.removeprefix("/")) for camera in cameras]
     return rrb.Grid(*shown, name="Cameras") if shown else None

@@ -18,9 +18,9 @@ from msgspec.structs import replace
 from imutool.errors import ConfigError
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun import connect, scene
+from imutool.viewing.rerun import connect, require_rerun, scene
 from imutool.viewing.rerun.connect import Listener
-from imutool.viewing.rerun.sdk import recording_name, require_rerun, rerun_version
+from imutool.viewing.rerun.sdk import recording_name, rerun_version
 
 MEMORY_LIMIT = "50%"  # of the machine's memory; the viewer's default is three quarters
 START_TIMEOUT_S = 10.0  # for a viewer that runs but does not listen yet, as from a slow disk; a dead one is seen at once
@@ -52,27 +52,13 @@ def open_viewer(logs: Sequence[RunData], *, source: bool = True, at_s: float | N
         ConfigError: no display, no viewer, or it dies before it has the logs.
     """
     viewer = start()
-    if trouble := viewer.trouble():  # before anything is sent: Rerun's client tries for 40 s to reach one that has died
-        raise trouble
     try:
         connect.send(logs, viewer.peer, source=source, at_s=at_s)
     except ConfigError as error:
         raise viewer.trouble() or error from error
-    if trouble := viewer.trouble(wait_s=0.0):
-        raise trouble
-    return Output("viewer", viewer.peer.url, "The viewer is open.")
-
-
-def open_empty() -> Listener:
-    """Open an empty viewer for a live view.
-
-    Raises:
-        ConfigError: no display, no viewer, or it dies at once.
-    """
-    viewer = start()
     if trouble := viewer.trouble():
         raise trouble
-    return viewer.peer
+    return Output("viewer", viewer.peer.url, "The viewer is open.")
 
 
 def has_display() -> bool:
@@ -88,7 +74,7 @@ class Viewer(NamedTuple):
     process: subprocess.Popen[bytes]
     peer: Listener
 
-    def trouble(self, wait_s: float = DIES_WITHIN_S) -> ConfigError | None:
+    def trouble(self, wait_s: float = 0.0) -> ConfigError | None:
         """Error if the viewer has died or dies within `wait_s`."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(wait_s)
@@ -111,7 +97,10 @@ def start() -> Viewer:
             raise _stopped(process)
         process.terminate()
         raise _no_viewer(f"the viewer did not listen within {START_TIMEOUT_S:g} s")
-    return Viewer(process, Listener(f"{connect.PLAIN}://127.0.0.1:{port}{connect.PATH}", rerun_version()))
+    viewer = Viewer(process, Listener(f"{connect.PLAIN}://127.0.0.1:{port}{connect.PATH}", rerun_version()))
+    if trouble := viewer.trouble(DIES_WITHIN_S):  # Rerun's client would try for 40 s to reach one that has died
+        raise trouble
+    return viewer
 
 
 def run(*arguments: str) -> subprocess.Popen[bytes]:
@@ -120,11 +109,7 @@ def run(*arguments: str) -> subprocess.Popen[bytes]:
     Raises:
         ConfigError: the program is missing or cannot be started.
     """
-    quiet: Mapping[str, Any] = {
-        "stdin": subprocess.DEVNULL,
-        "stdout": subprocess.DEVNULL,
-        "stderr": subprocess.DEVNULL,
-    }
+    quiet: Mapping[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
     try:
         return subprocess.Popen([str(binary()), "--bind", "127.0.0.1", *arguments], **quiet, start_new_session=True)
     except OSError as error:

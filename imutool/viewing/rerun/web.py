@@ -7,8 +7,7 @@ import html
 import http.server
 import shutil
 import urllib.request
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,9 @@ from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
 from imutool.recording import nanoseconds
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun import viewer
+from imutool.viewing.rerun import require_rerun, viewer
 from imutool.viewing.rerun.scene import rrd
-from imutool.viewing.rerun.sdk import recording_name, require_rerun
+from imutool.viewing.rerun.sdk import recording_name
 
 PAGE, START, RECORDING = "index.html", "start.js", "recording.rrd"
 RERUN_FILES = ("re_viewer.js", "re_viewer_bg.wasm")  # built for the installed version
@@ -50,13 +49,13 @@ def site(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = N
     return {**files, RECORDING: rrd(logs, source=source)}
 
 
-def catalog_site(title: str, urls: Sequence[str], origin: str) -> dict[str, bytes]:
+def catalog_site(urls: Sequence[str], origin: str) -> dict[str, bytes]:
     """Files of a web page that shows segments of a catalog, which listens at `origin`.
 
     Raises:
         ConfigError: Rerun is not installed, or its program does not run.
     """
-    return _page(title, " ".join(urls), policy=policy_with(origin))
+    return _page("fleet", " ".join(urls), policy=policy_with(origin))
 
 
 def policy_with(origin: str) -> str:
@@ -209,21 +208,21 @@ def export(
         ConfigError: as `check_folder`, Rerun is not installed or does not run, or the system refuses to write.
     """
     check_folder(folder, overwrite=overwrite)
-    require_rerun()
     files = site(logs, source=source, at_s=at_s)
     place = folder.absolute()  # "." has no name
     remove_abandoned(place)
     partial = temporary_path(place)
-    with _os_error_as_config_error(folder):
-        try:
-            partial.mkdir(parents=True)
-            for name, content in files.items():
-                (partial / name).write_bytes(content)
-            check_folder(folder, overwrite=overwrite)
-            _replace_folder(partial, place)
-        finally:
-            with contextlib.suppress(FileNotFoundError):
-                shutil.rmtree(partial)
+    try:
+        partial.mkdir(parents=True)
+        for name, content in files.items():
+            (partial / name).write_bytes(content)
+        check_folder(folder, overwrite=overwrite)
+        _replace_folder(partial, place)
+    except OSError as error:
+        raise ConfigError(f"cannot be written ({error.strerror})", where=folder, fix="Choose another place") from error
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            shutil.rmtree(partial)
     served = f"python -m http.server --bind 127.0.0.1 --directory {folder}"
     return Output("folder", str(folder / PAGE), f"Exported {folder} for any web server, for instance: {served}")
 
@@ -241,11 +240,3 @@ def _replace_folder(source: Path, target: Path) -> None:
         old.rename(target)
         raise
     shutil.rmtree(old)
-
-
-@contextmanager
-def _os_error_as_config_error(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise ConfigError(f"cannot be written ({error.strerror})", where=folder, fix="Choose another place") from error

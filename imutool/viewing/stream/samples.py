@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import msgspec
@@ -106,7 +106,7 @@ class Malformed:
     """Count of messages that hold no sample, with the first reason."""
 
     count: int = 0
-    first: str = field(default="")
+    first: str = ""
 
     def add(self, text: bytes | str, error: Exception) -> None:
         """Count a message."""

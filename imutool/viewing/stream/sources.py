@@ -84,7 +84,7 @@ def _source(name: str, malformed: Malformed, imu: str | None, speed: float, temp
     if parts.scheme == "zenoh":
         return _zenoh(name, malformed)
     if "://" in name and parts.scheme not in {"file", *STORES}:
-        raise ConfigError(f"{name!r}", where="source", expected=EXPECTED)
+        raise ConfigError(f"{name!r} is no source", where="source", expected=EXPECTED)
     return _replay(name, imu, speed, temperature)
 
 
@@ -273,7 +273,7 @@ def _address(name: str, default: int | None) -> tuple[str, int]:
         parts = urlsplit(name)
         port = parts.port or default
     except ValueError as error:
-        raise ConfigError(f"{name!r} ({error})", where="source", expected=EXPECTED) from error
+        raise ConfigError(f"{name!r} is no source ({error})", where="source", expected=EXPECTED) from error
     if port is None:
         raise ConfigError(f"{name!r} has no port", where="source", expected=EXPECTED)
     return parts.hostname or "127.0.0.1", port

@@ -159,7 +159,7 @@ def test_several_logs_are_compared_first_and_each_has_its_part(seen: RunData) ->
     assert {address.removeprefix("#") for address in parsed.addresses} <= set(parsed.ids)
     assert both.count("<details>") == 2
     assert len(svgs(both)) == 2 * (4 + 1)
-    with pytest.raises(ConfigError, match="no logs"):
+    with pytest.raises(ConfigError, match="no log is given"):
         report.page([])
 
 

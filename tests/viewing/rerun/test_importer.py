@@ -15,7 +15,7 @@ from support import saved_rrd, viewers
 
 from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
-from imutool.viewing.rerun.importer import INCOMPATIBLE, Target, rrd
+from imutool.viewing.rerun.importer import INCOMPATIBLE, rrd
 
 ROOT = Path(__file__).parents[3]
 COMMAND = [sys.executable, "-m", "imutool.viewing.rerun.importer"]
@@ -59,7 +59,7 @@ def test_a_foreign_file_costs_no_heavy_import(tmp_path: Path) -> None:
 
 
 def test_it_logs_to_the_recording_that_rerun_proposes(log: Path, tmp_path: Path) -> None:
-    content = rrd(log, Target("flight", "rec_7", "/below"))
+    content = rrd(log, "flight", "rec_7", "/below")
     assert content is not None
     (tmp_path / "out.rrd").write_bytes(content)
     entities = set(saved_rrd.read(tmp_path / "out.rrd"))

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import zip_longest
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from imutool.viewing.model import events
 from imutool.viewing.model.run_data import RunData, Trace
-from imutool.viewing.model.trajectory_error import Drift, Errors
-from imutool.viewing.rerun import sdk
+from imutool.viewing.model.trajectory_error import Drift, Errors, row_of_largest
+from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.entities import styles
-from imutool.viewing.rerun.entities.paths import row_of_largest
 from imutool.viewing.rerun.entities.signals import log_axes, log_curves
 from imutool.viewing.rerun.entities.styles import EVENT_COLOR, GREY, MODEL_COLORS, RAW_FADE, WORST_COLOR, Color, color_of
 from imutool.viewing.rerun.sdk import Scope
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 KINDS = ("orientation", "position")
 UNITS = {"orientation": "deg", "position": "m"}
@@ -70,9 +65,7 @@ def _log_drift(data: RunData, to: rr.RecordingStream, scope: Scope, trace: Trace
 
 def _log_worst(data: RunData, to: rr.RecordingStream, entity: str, errors: Errors, total: np.ndarray) -> None:
     """One point at the largest total error."""
-    import rerun as rr
-
-    row = row_of_largest(errors.t_ns, total)
+    row = row_of_largest(total)
     if row is not None:
         style = rr.SeriesPoints(names=["worst"], colors=[WORST_COLOR], markers=["diamond"], marker_sizes=[MARKER_SIZE])
         log_curves(to, data, f"{entity}/worst", errors.t_ns[row : row + 1], total[row : row + 1, None], style)
@@ -86,8 +79,6 @@ def event_kinds(data: RunData) -> list[str]:
 
 def log_events(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
     """Log `events/KIND`: states for the lane, and a text at the start of each event."""
-    import rerun as rr
-
     for kind in event_kinds(data):
         of_kind = sorted((event for event in data.events if event.kind == kind), key=lambda event: event.start_ns)
         entity = sdk.entity_path(scope, "events", kind)

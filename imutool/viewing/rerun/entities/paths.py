@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.recording import Poses, Times, nanoseconds
+from imutool.recording import Poses, nanoseconds
 from imutool.viewing.model.run_data import TRUTH, Rows, RunData, Trace, path_rows, round_up_125, split_at_gaps
-from imutool.viewing.model.trajectory_error import Errors
-from imutool.viewing.rerun import sdk
+from imutool.viewing.model.trajectory_error import Errors, row_of_largest
+from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.entities import styles
 from imutool.viewing.rerun.entities.styles import INK, TRUTH_COLOR, WORST_COLOR, Color, color_of, heat_colors
 from imutool.viewing.rerun.sdk import Scope
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 ROW_S = 1.0  # length of one row of a path: with a row per sample the viewer slows down
 MAX_ROWS = 3_600  # of one path; a longer log has longer rows
@@ -64,8 +60,6 @@ def path_pieces(poses: Poses) -> Pieces:
 
 def log_paths(data: RunData, to: rr.RecordingStream, scope: Scope, size: float) -> None:
     """Log world, paths and bodies of one log; `size` is the diagonal of the scene, m."""
-    import rerun as rr
-
     to.log(sdk.entity_path(scope, "world"), rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
     if data.truth is not None and len(data.truth):
         _log_path(to, data, sdk.entity_path(scope, "world", "gt"), data.truth, None, "gt", TRUTH_COLOR)
@@ -108,8 +102,6 @@ def _log_path(
     color: Color,
 ) -> None:
     """Path in rows of pieces; `by_error` (errors, scale) colours each by its largest error."""
-    import rerun as rr
-
     cut = path_pieces(poses)
     if not len(cut.first):
         return
@@ -133,8 +125,6 @@ def _largest(error: Float64[np.ndarray, " n"], cut: Pieces) -> Float64[np.ndarra
 
 def _log_body(to: rr.RecordingStream, data: RunData, entity: str, path: Poses, style: list[rr.AsComponents]) -> None:
     """Poses over time, and the style of the body."""
-    import rerun as rr
-
     rows = path_rows(path.p_wb)
     to.log(f"{entity}/body", *style, static=True, strict=True)
     columns = rr.Transform3D.columns(translation=path.p_wb[rows], quaternion=path.q_wb_wxyz[rows][:, Q_XYZW])
@@ -150,8 +140,6 @@ def error_rows(trace: Trace, errors: Errors) -> Rows:
 
 def _log_error_vectors(to: rr.RecordingStream, data: RunData, trace: Trace, errors: Errors, entity: str) -> None:
     """Vectors from the true to the estimated position."""
-    import rerun as rr
-
     rows = error_rows(trace, errors)
     if not len(rows):
         return
@@ -163,19 +151,12 @@ def _log_error_vectors(to: rr.RecordingStream, data: RunData, trace: Trace, erro
     to.send_columns(entity, sdk.data_times(data, trace.path.t_ns[rows]), columns, strict=True)
 
 
-def row_of_largest(t_ns: Times, values: Float64[np.ndarray, " n"]) -> int | None:
-    """Row of the largest value; None where no value is finite."""
-    return int(np.nanargmax(values)) if len(t_ns) and np.isfinite(values).any() else None
-
-
 def _log_worst(to: rr.RecordingStream, data: RunData, trace: Trace, entity: str, size: float) -> None:
     """Pole on the true path (the model's may be far off) at a model's largest orientation error."""
-    import rerun as rr
-
     if trace.is_raw or trace.errors is None or data.truth is None:
         return
     errors = trace.errors
-    row = row_of_largest(errors.t_ns, errors.orientation_total_deg)
+    row = row_of_largest(errors.orientation_total_deg)
     if row is None:
         return
     at_s = data.elapsed_s(errors.t_ns[row : row + 1])[0]
@@ -192,8 +173,6 @@ def _log_worst(to: rr.RecordingStream, data: RunData, trace: Trace, entity: str,
 
 def _log_legend(to: rr.RecordingStream, scope: Scope, top: float) -> None:
     """Colour scale of a path, LEGEND_WIDTH wide; tick labels below, title on the left."""
-    import rerun as rr
-
     strips = [[[left, 0.0], [right, 0.0]] for left, right in pairwise(np.linspace(0.0, LEGEND_WIDTH, LEGEND_STEPS + 1))]
     shares = (np.arange(LEGEND_STEPS) + 0.5) / LEGEND_STEPS
     bar = rr.LineStrips2D(strips, colors=heat_colors(shares, 1.0), radii=rr.Radius.ui_points(6.0))

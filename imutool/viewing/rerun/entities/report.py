@@ -4,33 +4,25 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.trajectory_error import WINDOWS_NOTE
-from imutool.viewing.rerun import sdk
+from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.entities.paths import error_scale_top
 from imutool.viewing.rerun.entities.styles import color_name
 from imutool.viewing.rerun.sdk import Scope
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 MAX_EVENTS = 40  # in the list; the Events tab shows all
 
 
 def log_report(data: RunData, to: rr.RecordingStream, scope: Scope, more: Sequence[str] = ()) -> None:
     """Log the text of `markdown` as `report`."""
-    import rerun as rr
-
     text = rr.TextDocument(markdown(data, more), media_type="text/markdown")
     to.log(sdk.entity_path(scope, "report"), text, static=True, strict=True)
 
 
 def log_comparison(logs: Sequence[RunData], to: rr.RecordingStream) -> None:
     """Log a table of the figures of several logs as `compare`."""
-    import rerun as rr
-
     to.log("compare", rr.TextDocument(comparison(logs), media_type="text/markdown"), static=True, strict=True)
 
 
@@ -75,7 +67,7 @@ def _colors(data: RunData) -> list[str]:
 
 def _figures(data: RunData) -> list[str]:
     rows = [[label, *map(_cell, values)] for label, values in data.table()]
-    return ["## Figures", "", *table(["figure", *_names(data)], rows), ""] if rows else []
+    return ["## Figures", "", *table(["figure", *(escape(trace.name) for trace in data.traces)], rows), ""] if rows else []
 
 
 def _windows(data: RunData) -> list[str]:
@@ -105,10 +97,6 @@ def _events(data: RunData) -> list[str]:
     hidden = len(data.events) - len(rows)
     more = [f"The tab Events shows {hidden} more.", ""] if hidden > 0 else []
     return ["## Events", "", *table(["at (s)", "for (s)", "kind", "what"], rows), "", *more]
-
-
-def _names(data: RunData) -> list[str]:
-    return [escape(trace.name) for trace in data.traces]
 
 
 def _cell(value: float | None) -> str:

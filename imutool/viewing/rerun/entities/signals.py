@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from imutool.array_types import Float64
 from imutool.recording import Times
-from imutool.units import AXES
+from imutool.units import AXES, SENSORS
 from imutool.viewing.model.run_data import MAX_CURVE_ROWS, RunData, Trace, curve_rows
-from imutool.viewing.rerun import sdk
+from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.entities import styles
 from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, GRID, INK, RAW_FADE, XYZ, axis_colors, blend_to_grey
 from imutool.viewing.rerun.sdk import Scope
 
-if TYPE_CHECKING:
-    import rerun as rr
-
-KINDS = ("gyro", "accel")
 SIGMAS = 3.0
 MAX_DERIVED_ROWS = 50_000  # of a computed curve (four minutes at 200 Hz); samples keep up to MAX_CURVE_ROWS
 
@@ -42,7 +37,7 @@ def log_signals(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
 
 def _log_samples(data: RunData, to: rr.RecordingStream, scope: Scope, trace: Trace) -> None:
     imu, role = trace.run.imu, sdk.role(trace)
-    for kind, values in zip(KINDS, (imu.gyro, imu.accel), strict=True):
+    for kind, values in zip(SENSORS, (imu.gyro, imu.accel), strict=True):
         entity = sdk.trace_path(data, trace, scope, "imu", kind, role)
         log_axes(to, data, trace, entity, imu.t_ns, values, max_rows=MAX_CURVE_ROWS)
 
@@ -50,7 +45,7 @@ def _log_samples(data: RunData, to: rr.RecordingStream, scope: Scope, trace: Tra
 def _log_bias(data: RunData, to: rr.RecordingStream, scope: Scope, trace: Trace) -> None:
     run, name, rank = trace.run, sdk.label(data, trace), model_index(data, trace)
     names = styles.axis_names("estimated" if name == "debiased" else name)
-    for kind, bias, columns in zip(KINDS, (run.gyro_bias, run.accel_bias), (slice(0, 3), slice(3, 6)), strict=True):
+    for kind, bias, columns in zip(SENSORS, (run.gyro_bias, run.accel_bias), (slice(0, 3), slice(3, 6)), strict=True):
         entity = sdk.trace_path(data, trace, scope, "bias", kind)
         log_curves(to, data, f"{entity}/estimated", run.imu.t_ns, bias, styles.axis_curves("debiased", names, rank=rank))
         if run.bias_std is not None:
@@ -92,8 +87,6 @@ def log_curves(
     max_rows: int | None = None,
 ) -> None:
     """Log one curve per column after its style, decimated to `max_rows` (MAX_DERIVED_ROWS)."""
-    import rerun as rr
-
     to.log(entity, style, static=True, strict=True)
     rows = curve_rows(values, MAX_DERIVED_ROWS if max_rows is None else max_rows)
     # strict: Rerun only warns of a length that does not match, and then the rows are missing
@@ -136,7 +129,7 @@ def log_spectra(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
 
 def sensors_with_spectrum(data: RunData) -> list[str]:
     """Sensors that have a spectrum."""
-    return [kind for kind in KINDS if any(kind in trace.spectra for trace in data.traces)]
+    return [kind for kind in SENSORS if any(kind in trace.spectra for trace in data.traces)]
 
 
 def decade_frame(data: RunData, kind: str) -> DecadeFrame:
@@ -163,8 +156,6 @@ def decimate_points(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "
 
 
 def _log_spectrum(data: RunData, to: rr.RecordingStream, entity: str, trace: Trace, kind: str, frame: DecadeFrame) -> None:
-    import rerun as rr
-
     spectrum = trace.spectra[kind]
     strips = [decimate_points(frame.at(spectrum.frequency_hz, np.sqrt(column))) for column in spectrum.density.T]
     pale = trace.is_raw and bool(data.models())
@@ -176,8 +167,6 @@ def _log_spectrum(data: RunData, to: rr.RecordingStream, entity: str, trace: Tra
 
 def _log_frame(to: rr.RecordingStream, entity: str, frame: DecadeFrame) -> None:
     """Lines at whole decades, with tick labels left and below."""
-    import rerun as rr
-
     across = np.arange(frame.low_hz, frame.high_hz + 1)
     up = np.arange(frame.low, frame.high + 1)
     x = (across - frame.low_hz) / (frame.high_hz - frame.low_hz) * WIDTH
@@ -189,8 +178,6 @@ def _log_frame(to: rr.RecordingStream, entity: str, frame: DecadeFrame) -> None:
 
 
 def _log_labels(to: rr.RecordingStream, entity: str, positions: Sequence[Sequence[float]], labels: Sequence[str]) -> None:
-    import rerun as rr
-
     dots = rr.Radius.ui_points(0.0)
     text = rr.Points2D(positions, labels=list(labels), colors=[INK] * len(labels), radii=dots, show_labels=True)
     to.log(entity, text, static=True, strict=True)

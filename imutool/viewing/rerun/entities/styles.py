@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from imutool.array_types import Float64, UInt8
 from imutool.units import AXES
 from imutool.viewing.model.run_data import RunData, Trace
+from imutool.viewing.rerun import rr
 from imutool.viewing.rerun.sdk import Role
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 Color = tuple[int, int, int]
 
@@ -78,8 +75,6 @@ def curves(names: Sequence[str], colors: Sequence[Color], width: float) -> rr.Se
 
 def line_style(names: Sequence[str], colors: Sequence[Color], widths: Sequence[float]) -> rr.SeriesLines:
     """Style of curves of different widths; a mean per pixel would make noise look smaller."""
-    import rerun as rr
-
     extremes = rr.components.AggregationPolicy.MinMax
     return rr.SeriesLines(names=list(names), colors=list(colors), widths=list(widths), aggregation_policy=extremes)
 
@@ -114,16 +109,12 @@ def total_error_curve(role: Role, name: str, color: Color) -> rr.SeriesLines:
 
 def path_style(role: str, color: Color | None) -> rr.LineStrips3D:
     """Width of a path (`gt`, `raw` or `debiased`) and its colour, if it has only one."""
-    import rerun as rr
-
     radii = rr.Radius.ui_points([PATH_RADII[role]])
     return rr.LineStrips3D.from_fields(radii=radii, colors=None if color is None else [color])
 
 
 def body_style(role: str, name: str, color: Color, size_m: float) -> list[rr.AsComponents]:
     """Axes that move with a body, a dot at its position and a label."""
-    import rerun as rr
-
     length = AXIS_SHARE * size_m
     label = [0.0, 0.0, 1.3 * length * LABEL_SIDES[role]]
     dots = rr.Points3D(
@@ -138,8 +129,6 @@ def body_style(role: str, name: str, color: Color, size_m: float) -> list[rr.AsC
 
 def state_style(label: str, color: Color) -> rr.StateConfiguration:
     """Style of a lane of states that is visible only inside an interval."""
-    import rerun as rr
-
     return rr.StateConfiguration(values=list(STATES), labels=[label, ""], colors=[color, GREY], visible=[True, False])
 
 
