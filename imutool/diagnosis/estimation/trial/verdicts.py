@@ -26,13 +26,15 @@ from imutool.diagnosis.estimation.trial.model_error import (
     FOLLOWING,
     LowPassError,
     below_model_error,
+    below_reference_error,
+    is_rim,
     of_motion,
     with_low_pass_error,
 )
 from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection
 from imutool.diagnosis.estimation.trial.unseen_time import first_refuted
 from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
-from imutool.diagnosis.estimation.unnamed_effects import has_no_size, plausible_part, takes_noise
+from imutool.diagnosis.estimation.unnamed_effects import has_no_size, is_over_at_once, plausible_part, takes_noise
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked, of_each
@@ -153,6 +155,8 @@ class Trial:
             every = with_left(None)
             below = frozenset(key for key in hidden(every) if not self._shown_elsewhere(key, every, whole))
         below |= {one.effect.key for one in verdicts if self._may_be_error(one.effect, whole)}
+        below |= {one.effect.key for one in verdicts if below_reference_error(one.effect, one.gain, whole)}
+        below |= {one.effect.key for one in verdicts if exact and is_rim(one.effect, one.gain, whole)}
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in below else verdict for verdict in verdicts]
 
     def _shown_elsewhere(self, key: str, gains: Mapping[str, float], whole: Fit) -> bool:
@@ -185,7 +189,11 @@ class Trial:
         no_answer = (
             no_answer
             or is_coloured_noise(effect, theta, whole)
-            or (effect.name in HYSTERESES and leaves_slow_motion(whole, effect.sensors[0], gain[0]))
+            or is_over_at_once(effect, theta, self.settings.implausible_factor)
+            or (
+                effect.name in HYSTERESES
+                and leaves_slow_motion(whole, effect.sensors[0], self.settings.hysteresis_leaves * gain[0])
+            )
         )
         if no_answer or has_no_size(effect, theta, std, curve=(curve := isinstance(effect.forward, SplineCurve))):
             return None
