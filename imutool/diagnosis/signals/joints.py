@@ -81,9 +81,8 @@ def joint_pairs(
     if moving and len(driven) >= LEAST_EFFORTS * len(joints):
         yield _efforts(topic, moving, mine, other)
         return
-    for path in both:
-        if is_rate_of(mine[path], mine.get(path.replace("velocity", "position", 1))):
-            continue
+    known = rates(mine, other)
+    for path in (path for path in both if path not in known):
         kind = "positions" if path.startswith("position") else "number"
         effort = mine.get(path.replace("position", "effort"))
         state = {"effort": effort} if kind == "positions" and effort is not None else {}
@@ -91,20 +90,25 @@ def joint_pairs(
         yield unwrapped(replace(pair, kind=kind, state=state, units=(JOINT_UNITS[path.partition("[")[0]],)))
 
 
-def is_rate_of(velocity: Fields, position: Fields | None) -> bool:
-    """Whether a velocity is the rate of a position at the same stamps, up to a sample late, and so says no more than it.
+def rates(mine: Mapping[str, Fields], other: Mapping[str, Fields]) -> list[str]:
+    """Recorded velocities that are the rates of positions which both logs hold, and so say no more than these."""
+    found = [(path, path.replace("velocity", "position")) for path in mine if path.startswith("velocity") and path in other]
+    return [path for path, of in found if of in mine and of in other and _is_rate(mine[path], mine[of])]
+
+
+def _is_rate(velocity: Fields, position: Fields) -> bool:
+    """Whether a velocity is the rate of a position at the same stamps, up to a sample late.
 
     What its integral leaves of the position, but for white noise, is compared with the position's motion.
     """
-    if position is None or len(position) < LEAST_RATES or not np.array_equal(velocity.t_ns, position.t_ns):
+    if len(position) < LEAST_RATES or not np.array_equal(velocity.t_ns, position.t_ns):
         return False
     t_s = seconds(position.t_ns, int(position.t_ns[0]))
-    slow = butter(2, min(SLOWER_HZ / (0.5 * (len(t_s) - 1) / t_s[-1]), 0.5), "highpass", output="sos")
+    period_s = float(np.median(np.diff(t_s)))
+    slow = butter(2, min(2.0 * SLOWER_HZ * period_s, 0.5), "highpass", output="sos")
     gone = cumulative_trapezoid(velocity.values, t_s, initial=0)
     q, left, v = sosfiltfilt(slow, np.stack([position.values, position.values - gone, velocity.values], axis=1), axis=0).T
-    period_s = float(np.median(np.diff(t_s)))
-    late_s = float(np.clip(left @ v / max(v @ v, 1e-300), -period_s, period_s))
-    left = left - late_s * v
+    left = left - float(np.clip(left @ v / max(v @ v, 1e-300), -period_s, period_s)) * v
     noise = float(white_noise(left[:, None])[0])
     return bool(left.var() - noise**2 < RATE_ERROR**2 * q.var())
 

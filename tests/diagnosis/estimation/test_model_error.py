@@ -19,6 +19,8 @@ from imutool.diagnosis.estimation.trial.model_error import (
     OF_MOTION,
     LowPassError,
     below_model_error,
+    below_reference_error,
+    is_rim,
     with_low_pass_error,
 )
 from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection
@@ -70,6 +72,35 @@ def test_a_small_filter_beside_a_low_pass_is_what_another_form_leaves(name: str,
         names = {key: key.partition(":")[0], name: name}
         found = below_model_error({key: 1.0, name: small}, SETTINGS, denoised=False, poses=False, names=names)
         assert found == ({name} if hidden else set())
+
+
+@pytest.mark.parametrize(("name", "hidden"), [("gyro_delay", True), ("gyro_bias_step", False)])
+def test_a_small_delay_beside_a_hysteresis_is_a_turn_between_two_samples(name: str, hidden: bool) -> None:
+    small = {"gyro_hysteresis": 1.0, name: 0.5 * SETTINGS.model_error_resonance}
+    assert below_model_error(small, SETTINGS, denoised=False, poses=False) == ({name} if hidden else set())
+
+
+@pytest.mark.parametrize(("name", "below"), [("gyro_scale", True), ("gyro_bias_drift", False)])
+def test_what_moves_with_the_body_is_more_than_the_rounding_of_a_simulation(name: str, below: bool) -> None:
+    felt = planted.rich()
+    now = fit([planted.weighed(planted.pair(felt))], ())
+    (effect,) = catalogue.diagnosed([name])
+    gyro = (planted.ideal(felt)[:, :3] - planted.ideal(felt)[:, :3].mean(axis=0)) / planted.NOISE[0]
+    least = SETTINGS.model_error_reference * float((gyro[now.logs[0].rows("fitted")] ** 2).sum())
+    assert below_reference_error(effect, 0.99 * least, now) == below
+    assert not below_reference_error(effect, 1.01 * least, now)
+
+
+@pytest.mark.parametrize(("name", "rim"), [("accel_scale", True), ("accel_bias_step", False), ("gyro_scale", False)])
+def test_a_name_that_explains_little_of_a_far_larger_misfit_is_its_rim(name: str, rim: bool) -> None:
+    """The force follows the cube of the rate, which no effect does: whatever moves as well explains some of it."""
+    felt = planted.rich()
+    added = np.concatenate([np.zeros_like(felt.gyro), 0.5 * felt.gyro[:, [1, 2, 0]] ** 3], axis=1)
+    now = fit([planted.weighed(planted.pair(felt, added=added))], ())
+    (effect,) = catalogue.diagnosed([name])
+    left = now.objective - now.numbers
+    assert is_rim(effect, 0.02 * left, now) == rim
+    assert not is_rim(effect, 0.5 * left, now)
 
 
 def test_what_does_not_follow_the_motion_is_told_however_faint() -> None:
