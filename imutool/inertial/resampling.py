@@ -16,10 +16,11 @@ MOST_FACTOR = 8
 
 
 def refined(x: Float64[np.ndarray, "n k"], noise: Float64[np.ndarray, " k"], count: int) -> Float64[np.ndarray, "m k"]:
-    """Samples so dense that a cubic spline through them errs by too little to show in `count` samples with some noise.
+    """Samples so dense that a cubic spline through them errs by less than noise hides.
 
-    Their rate is a multiple of the old one. Old samples stay, and nothing is added above half of the old rate. The line from
-    the first sample to the last is taken off before: the rest is zero at both ends, and its odd mirror images join smoothly.
+    It errs by too little to show in `count` samples with that noise. Their rate is a multiple of the old one. Old samples
+    stay, and nothing is added above half of the old rate. The line from the first sample to the last is taken off before: the
+    rest is zero at both ends, and its odd mirror images join smoothly.
     """
     factor = refinement(x, noise, count)
     if factor == 1:
@@ -32,10 +33,11 @@ def refined(x: Float64[np.ndarray, "n k"], noise: Float64[np.ndarray, " k"], cou
 
 
 def refinement(x: Float64[np.ndarray, "n k"], noise: Float64[np.ndarray, " k"], count: int) -> int:
-    """Factor of the rate from which on a cubic spline errs by too little to show in `count` samples with some noise.
+    """Factor of the rate from which on a cubic spline errs by less than noise hides.
 
-    It passes a frequency f of a rate r on as sinc(f/r)^4 / (2/3 + cos(2 pi f/r) / 3) (Unser, IEEE Signal Processing Magazine
-    16, 1999), and shows as much as it loses of it at other frequencies.
+    It errs by too little to show in `count` samples with that noise. It passes a frequency f of a rate r on as sinc(f/r)^4 /
+    (2/3 + cos(2 pi f/r) / 3) (Unser, IEEE Signal Processing Magazine 16, 1999), and shows as much as it loses of it at other
+    frequencies.
     """
     share, power = periodogram(x, 1.0, "hann", axis=0)
     factor, most = 1, AS_GOOD / np.sqrt(count) * noise

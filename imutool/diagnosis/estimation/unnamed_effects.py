@@ -270,14 +270,6 @@ def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> boo
     return vague or (bool(amounts) and bool((np.abs(theta[amounts]) < std[amounts]).all()))
 
 
-def is_over_at_once(effect: Effect, theta: Theta, factor: float) -> bool:
-    """Whether a drift is far larger than plausible: it was over before the first sample, of which any size fits the tail."""
-    if effect.reached is None:
-        return False
-    size = np.abs(theta[:-1]) * effect.reached(float(theta[-1]))
-    return bool((size > factor * np.array(effect.plausible)[:-1]).any())
-
-
 def smoothing(found: Fit, first: int) -> Chosen:
     """Low-passes that only smooth what is left of a simulation's noise, without their lag."""
     filters = [one for one in found.chosen[first:] if one[0].lagless and any(log.pair.denoised for log in found.logs)]

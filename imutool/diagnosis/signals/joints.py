@@ -91,7 +91,7 @@ def joint_pairs(
 
 
 def rates(mine: Mapping[str, Fields], other: Mapping[str, Fields]) -> list[str]:
-    """Recorded velocities that are the rates of positions which both logs hold, and so say no more than these."""
+    """Recorded velocities that are the rates of positions which both logs hold."""
     found = [(path, path.replace("velocity", "position")) for path in mine if path.startswith("velocity") and path in other]
     return [path for path, of in found if of in mine and of in other and _is_rate(mine[path], mine[of])]
 

@@ -20,6 +20,7 @@ from imutool.diagnosis.estimation.trial.model_error import (
     LowPassError,
     below_model_error,
     below_reference_error,
+    is_over_at_once,
     is_rim,
     with_low_pass_error,
 )
@@ -28,6 +29,7 @@ from imutool.diagnosis.reference.coverage import without_unseen_offset
 from imutool.diagnosis.settings import DiagnoseSettings, SearchSettings
 from imutool.recording import Recording
 from imutool.sensor import catalogue
+from imutool.sensor.effects import gyro_bias_drift
 
 SETTINGS = SearchSettings()
 FAST_HZ, RATE_HZ, DURATION_S = 2000, 250, 24.0
@@ -101,6 +103,22 @@ def test_a_name_that_explains_little_of_a_far_larger_misfit_is_its_rim(name: str
     left = now.objective - now.numbers
     assert is_rim(effect, 0.02 * left, now) == rim
     assert not is_rim(effect, 0.5 * left, now)
+
+
+@pytest.mark.parametrize(
+    ("name", "theta", "over"),
+    [
+        ("accel_bias_drift", [-8.0, 5.0, 1.0, 0.14], True),
+        ("accel_bias_drift", [-0.8, 0.5, 0.1, 2.0], False),
+        ("accel_bias_drift", [30.0, 0.0, 0.0, 5000.0], False),  # of which 24 s show 0.14 m/s²
+        ("accel_bias_step", [-8.0, 5.0, 1.0, 0.14], False),
+    ],
+)
+def test_a_drift_that_was_over_before_the_first_sample_has_no_size(name: str, theta: list[float], over: bool) -> None:
+    effect = planted.acting({name: theta})[0][0]
+    if effect.reached is not None:
+        effect = next(gyro_bias_drift.within([effect], planted.DURATION_S))
+    assert is_over_at_once(effect, np.array(theta), SETTINGS.implausible_factor) == over
 
 
 def test_what_does_not_follow_the_motion_is_told_however_faint() -> None:

@@ -10,9 +10,7 @@ from support import planted
 
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.estimation.gauss_newton import fit
-from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.effect import Effect
-from imutool.sensor.effects import gyro_bias_drift
 from imutool.sensor.samples import IdealMotion
 
 SURE = 4.0
@@ -205,19 +203,3 @@ def test_a_term_that_takes_away_the_motion_of_poses_is_their_noise(gain: float, 
     pair = replace(planted.pair(planted.planar()), band_hz=6.0 if poses else None)
     (term,) = (one for one in unnamed.terms(unnamed.like([pair])) if one.variant == "gyro.z:omega_z f_z")
     assert unnamed.takes_noise(term, np.array([gain]), [planted.weighed(pair)]) == shrinks
-
-
-@pytest.mark.parametrize(
-    ("name", "theta", "over"),
-    [
-        ("accel_bias_drift", [-8.0, 5.0, 1.0, 0.14], True),
-        ("accel_bias_drift", [-0.8, 0.5, 0.1, 2.0], False),
-        ("accel_bias_drift", [30.0, 0.0, 0.0, 5000.0], False),  # of which 24 s show 0.14 m/s²
-        ("accel_bias_step", [-8.0, 5.0, 1.0, 0.14], False),
-    ],
-)
-def test_a_drift_that_was_over_before_the_first_sample_has_no_size(name: str, theta: list[float], over: bool) -> None:
-    effect = planted.acting({name: theta})[0][0]
-    if effect.reached is not None:
-        effect = next(gyro_bias_drift.within([effect], planted.DURATION_S))
-    assert unnamed.is_over_at_once(effect, np.array(theta), SearchSettings().implausible_factor) == over

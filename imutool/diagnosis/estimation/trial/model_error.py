@@ -89,12 +89,23 @@ def below_reference_error(effect: Effect, gain: float, found: Fit) -> bool:
 
 
 def is_rim(effect: Effect, gain: float, found: Fit) -> bool:
-    """Whether an effect that follows the motion is the rim of a far larger misfit of slow motion on each of its sensors.
+    """Whether an effect is the rim of a far larger misfit, of slow motion on its sensors.
 
     Whatever moves with the body explains some of such a misfit, so a name for it would be wrong.
     """
     follows, least = of_motion(effect) or effect.name in FILTERS, found.logs[0].pair.settings.search.rim_leaves * gain
     return follows and all(leaves_slow_motion(found, sensor, least) for sensor in effect.sensors)
+
+
+def is_over_at_once(effect: Effect, theta: Theta, factor: float) -> bool:
+    """Whether a drift is far larger than plausible, over before the first sample.
+
+    Any size of it fits what the first samples show of its tail.
+    """
+    if effect.reached is None:
+        return False
+    size = np.abs(theta[:-1]) * effect.reached(float(theta[-1]))
+    return bool((size > factor * np.array(effect.plausible)[:-1]).any())
 
 
 class LowPassError(NamedTuple):

@@ -27,6 +27,7 @@ from imutool.diagnosis.estimation.trial.model_error import (
     LowPassError,
     below_model_error,
     below_reference_error,
+    is_over_at_once,
     is_rim,
     of_motion,
     with_low_pass_error,
@@ -34,7 +35,7 @@ from imutool.diagnosis.estimation.trial.model_error import (
 from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection
 from imutool.diagnosis.estimation.trial.unseen_time import first_refuted
 from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
-from imutool.diagnosis.estimation.unnamed_effects import has_no_size, is_over_at_once, plausible_part, takes_noise
+from imutool.diagnosis.estimation.unnamed_effects import has_no_size, plausible_part, takes_noise
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked, of_each
