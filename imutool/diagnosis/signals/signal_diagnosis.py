@@ -150,7 +150,7 @@ def _with_own_search(signal: AlignedSignal) -> AlignedSignal:
     """Signal whose search is for effects of each column, but for those that `above_model_error` would leave out."""
     search = signal.settings.search
     most = max(search.most_effects, search.effects_each_column * signal.columns)
-    least = max(search.negligible_share, search.model_error if signal.band_hz is None else SMALL_GAIN)
+    least = max(search.negligible_share, 0.0 if signal.band_hz is None else SMALL_GAIN)
     search = msgspec.structs.replace(search, most_effects=most, negligible_share=least)
     return replace(signal, settings=msgspec.structs.replace(signal.settings, search=search))
 

@@ -78,7 +78,7 @@ def below_reference_error(effect: Effect, gain: float, found: Fit) -> bool:
 
     It interpolates, integrates and rounds, so its motion errs by a share, however little noise a recording has.
     """
-    if not (of_motion(effect) or effect.name in FILTERS) or not all(log.pair.exact for log in found.logs):
+    if not _follows_body(effect, found) or not all(log.pair.exact for log in found.logs):
         return False
     motion = 0.0
     for log in found.logs:
@@ -93,8 +93,14 @@ def is_rim(effect: Effect, gain: float, found: Fit) -> bool:
 
     Whatever moves with the body explains some of such a misfit, so a name for it would be wrong.
     """
-    follows, least = of_motion(effect) or effect.name in FILTERS, found.logs[0].pair.settings.search.rim_leaves * gain
-    return follows and all(leaves_slow_motion(found, sensor, least) for sensor in effect.sensors)
+    least = found.logs[0].pair.settings.search.rim_leaves * gain
+    return _follows_body(effect, found) and all(leaves_slow_motion(found, sensor, least) for sensor in effect.sensors)
+
+
+def _follows_body(effect: Effect, found: Fit) -> bool:
+    """Whether an effect of an IMU follows the motion of its body."""
+    of_body = of_motion(effect) or effect.name in FILTERS
+    return of_body and bool(effect.sensors) and all(isinstance(log.pair, Pair) for log in found.logs)
 
 
 def is_over_at_once(effect: Effect, theta: Theta, factor: float) -> bool:
