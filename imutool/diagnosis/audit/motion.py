@@ -34,7 +34,7 @@ from imutool.units import AXES, SENSORS, Sensor
 Vectors = Float64[np.ndarray, "n 3"]
 Matrix = Float64[np.ndarray, "3 3"]
 JERK_S = 1e-3  # half of the step of a central difference
-BLOCK_S = 2.0  # of the robust covariance, at least
+BLOCK_S = 2.0  # of the robust covariance
 SHOWN, ORDER = 0.5, 4  # of a curve's cut-off, up to which it follows a motion to 2 %; of the filter
 LEAST_BLOCK = 4.0  # periods of the highest frequency in a block, so that blocks are independent
 BANDS = (1.0, 0.5, 0.25)  # of the band that the poses show: a curve follows the slower motion better
@@ -105,7 +105,7 @@ def kinematics(log: Recording) -> Kinematics:
     t_s = np.asarray((imu.t_ns[used] - imu.t_ns[used][0]) * 1e-9, dtype=np.float64)
     R_wb, omega, alpha, v_w, a_w, j_w = (np.concatenate(each) for each in zip(*parts, strict=True))
     longest = max(motion.stretches, key=lambda stretch: stretch.duration_s)
-    band_hz = SHOWN * min(longest.cutoff_hz)
+    band_hz = max(SHOWN * min(longest.cutoff_hz), LEAST_BLOCK / BLOCK_S)
     return Kinematics(
         t_s, imu.gyro[used], imu.accel[used], R_wb, omega, alpha, v_w, a_w, j_w, period_s=imu.period_s, band_hz=band_hz
     )
@@ -206,8 +206,7 @@ def _solved(
     """
     p = x.shape[2]
     whole, target = np.concatenate([x, np.tile(np.eye(3), (len(y), 1, 1))], axis=2), y - x @ ideal
-    least_hz = min(k.band_hz, LEAST_BLOCK / BLOCK_S)
-    bands = sorted({max(share * k.band_hz, least_hz) for share in BANDS}, reverse=True)
+    bands = sorted({max(share * k.band_hz, LEAST_BLOCK / BLOCK_S) for share in BANDS}, reverse=True)
     each = [_in_band(replace(k, band_hz=band_hz), target, whole) for band_hz in bands]
     theta, std = (np.array(values) for values in zip(*each, strict=True))
     square = (np.array(bands)[:, None] / bands[0]) ** 2
@@ -223,7 +222,7 @@ def _solved(
 def _in_band(
     k: Kinematics, y: Vectors, x: Float64[np.ndarray, "n 3 p"]
 ) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"]]:
-    """Coefficients with deviations by independent blocks; Huber weights against shocks. The last three are biases."""
+    """Coefficients with deviations by blocks of two seconds; Huber weights against shocks. The last three are biases."""
     A, target = k.shown(x), k.shown(y)
     size = np.sqrt((A**2).sum(axis=(0, 1)))
     size[size < 1e-9 * size.max()] = np.inf
@@ -236,7 +235,7 @@ def _in_band(
         left = target - A @ theta
         length = np.sqrt((left**2).sum(axis=1))
         weight = 1.0 / np.maximum(1.0, length / max(3.0 * float(np.median(length)), 1e-12))
-    block = np.floor(k.t_s / max(BLOCK_S, LEAST_BLOCK / k.band_hz)).astype(int)
+    block = np.floor(k.t_s / BLOCK_S).astype(int)
     scores = np.zeros((int(block.max()) + 1, p))
     np.add.at(scores, block, np.einsum("n,nap,na->np", weight, A, left))
     half = np.linalg.solve(H, scores.T)

@@ -9,19 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt
-from scipy.spatial.transform import Rotation
 from support.audit_bench import bench
 
 from imutool.config import build
 from imutool.diagnosis.audit import simulator_faults
 from imutool.diagnosis.audit.bandwidth import most_filter_delay
-from imutool.diagnosis.audit.motion import SHOWN, kinematic_fit, kinematics
+from imutool.diagnosis.audit.motion import kinematic_fit, kinematics
 from imutool.diagnosis.audit.noise import Expected, fast_noise, noise_faults
 from imutool.diagnosis.audit.timing import clear, timing_faults
 from imutool.diagnosis.result import Estimate
 from imutool.noise.datasheet import Noise
-from imutool.recording import Imu, Poses
-from imutool.sensor.trajectory import smooth_motion
+from imutool.recording import Imu
 
 DURATION_S = 16.0
 
@@ -137,18 +135,3 @@ def test_delays_of_gyro_acceleration_and_attitude_are_weighed_together(
 ) -> None:
     estimates = {name: Estimate(0.01 * value, 0.01 * std, "s") for name, (value, std) in periods.items()}
     assert {(fault.fault, fault.signal) for fault in timing_faults(estimates, 0.01, (0.0, 0.0))} == accused
-
-
-def test_no_band_is_wider_than_the_poses_show() -> None:
-    """Poses with half a degree of noise follow a motion up to 2 Hz or less."""
-    sim, _, _ = bench.made("null", 5, DURATION_S)
-    rng, poses = np.random.default_rng(0), sim.truth
-    turned = Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) * Rotation.from_rotvec(
-        0.1 * rng.normal(size=poses.p_wb.shape)
-    )
-    noisy = Poses(poses.t_ns, poses.p_wb, np.ascontiguousarray(turned.as_quat(scalar_first=True)))
-    moved = kinematics(replace(sim, truths={"/pose": noisy}))
-    assert moved.band_hz == SHOWN * min(smooth_motion(noisy).stretches[0].cutoff_hz)
-    assert moved.band_hz < 2.0
-    found = kinematic_fit(moved).estimates
-    assert not any(clear(found[axis]) for axis in "xyz")
