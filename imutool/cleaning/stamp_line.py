@@ -34,6 +34,7 @@ LEAST_SECONDS, LEAST_HZ = 3, 4.0  # of a log whose fractions are judged
 EVEN = 5.0  # times: most by which the step into the next second differs from the others
 OTHER_RATE = 1.25  # of a window's rate, that of the next: no crystal drifts so far
 SIDE = 4  # blocks, of a quarter of a window
+ROUNDED_NS = 1000  # a microsecond, or what a float of seconds since 1970 keeps of it
 BUNCHED = 0.3  # of the mean period: a shorter step is within a batch
 BATCHED = 0.3  # share of such steps from which on stamps come in batches
 
@@ -155,6 +156,20 @@ def _fraction_unit(stamp_ns: Int64[np.ndarray, " n"]) -> int:
     steps = np.diff(stamp_ns + (unit - 1) * fraction)
     usual, leap = float(np.median(steps)), float(np.median(steps[into_next]))
     return unit if usual > 0 and usual / EVEN <= leap <= usual * EVEN else 1
+
+
+def unrounded(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+    """Stamps of an even clock without their rounding; others as they are.
+
+    Rounded to a microsecond, poses at 2 m/s err by it, and their second derivative has lines of it.
+    """
+    steps = np.diff(stamp_ns)
+    period_ns = float(np.median(steps)) if len(steps) else 0.0
+    if period_ns <= 0.0:
+        return stamp_ns
+    number, since = np.concatenate([[0.0], np.cumsum(np.rint(steps / period_ns))]), stamp_ns - stamp_ns[0]
+    even = np.rint(np.polynomial.Polynomial.fit(number, since, 1)(number)).astype(np.int64)
+    return stamp_ns[0] + even if np.abs(since - even).max() <= ROUNDED_NS else stamp_ns
 
 
 def restamped(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:

@@ -186,7 +186,9 @@ def ringing(logs: Sequence[WhitenedImu], after: Sequence[np.ndarray], settings: 
         return []
     edges_hz = f0 / RINGING_BAND, min(f0 * RINGING_BAND, 0.49 * rate_hz)
     alone = sosfiltfilt(butter(2, edges_hz, "bandpass", fs=rate_hz, output="sos"), residual, axis=0)[rows]
-    if (alone**4).mean() < settings.least_kurtosis * (alone**2).mean() ** 2:  # a rotor's speed wanders, and nothing decays
+    least = log.pair.settings.search.model_error_reference * float(after[0][rows, 3:].var(axis=0).sum())  # a simulation rounds
+    wanders = (alone**4).mean() < settings.least_kurtosis * (alone**2).mean() ** 2  # as a rotor's speed: nothing decays
+    if wanders or (alone**2).sum(axis=1).mean() < least:
         return []
     ratio = float(total[peak]) / floor
     p_value = float(chi2.sf(2.0 * ratio * settings.blocks, 2 * settings.blocks))

@@ -182,6 +182,7 @@ class SearchSettings(Settings, frozen=True):
     white_chi_square: Positive = 1.15  # reduced: up to it the noise beside a simulation is taken as measured
     white_kurtosis: Positive = 6.0  # of an axis' white residuals, from which on few samples hold the squares (noise has 3)
     hysteresis_leaves: Share = 0.1  # of its squares, at most, in slow motion of its sensor: it fits a part of many a misfit
+    rim_leaves: Positive = 10.0  # times its squares in slow motion, of a misfit beside a simulation whose rim a name may be
     exchanged_effects: Count = 3  # up to which each is compared with replacements
     give_up_factor: Positive = 4.0  # over the needed squares: a fit as far off after a few steps gets no nearer
     rivals: Annotated[int, msgspec.Meta(ge=0)] = 3  # effects that are tried in another's place for `similar`
@@ -189,6 +190,7 @@ class SearchSettings(Settings, frozen=True):
     common_arm_share: Share = 0.7  # of a size effect's squares that a lever arm alone has to remove to replace it
     most_taken: Share = 0.7  # of an axis' motion by poses, that a term, a curve or a limit may take
     implausible_factor: Positive = 4.0  # over the plausible size: a larger linear parameter is a fit to noise
+    model_error_reference: Positive = 1e-9  # of a sensor's motion beside a simulation (0.003 % of its size): splines, rounding
     model_error: Positive = 1e-5  # of the largest effect's squares (0.3 % of its size) may be its model's error
     model_error_denoised: Positive = 1e-3  # the same beside a simulation whose noise was filtered out (3 %)
     model_error_resonance: Positive = 1e-2  # the same beside a mount that rings, whose model is simplified

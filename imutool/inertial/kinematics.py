@@ -22,6 +22,7 @@ DEGREE = 5  # continuous angular acceleration needs 3; 5 also keeps its slope an
 SMALLEST_NORM = 0.1  # a quaternion spline of smaller norm has knots too far apart
 G_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
 G_W.flags.writeable = False
+GRAVITIES_M_S2 = (GRAVITY_M_S2, 9.80665, 9.8)  # of simulators, which know no other
 
 Vectors = Float64[np.ndarray, "n 3"]
 Spline = Any  # a BSpline: scipy.interpolate is imported where one is made, for its import takes 0.2 s
@@ -148,6 +149,21 @@ def fit_trajectory(poses: Poses) -> Trajectory:
     t = seconds(poses.t_ns, int(poses.t_ns[0]))
     position, quaternion = (make_interp_spline(t, y, k=DEGREE) for y in (poses.p_wb, continuous(poses.q_wb_wxyz)))
     return Trajectory(int(poses.t_ns[0]), position, quaternion)
+
+
+def gravity_error(R_wb: Float64[np.ndarray, "n 3 3"], y: Vectors, least: float) -> Float64[np.ndarray, "3"]:
+    """By how much a simulator's own gravity differs from the usual one (m/s², world frame).
+
+    `y` is what its accelerometer reads beyond its motion, with a constant of the body. If another gravity gains fewer than
+    `least` squares of noise, it is the nearest of those that simulators have.
+    """
+    R_wb, y = (x[:: len(y) // 20_000 + 1] for x in (R_wb, y))
+    columns = np.concatenate([R_wb.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R_wb.shape)], axis=2)
+    found = np.asarray(np.linalg.lstsq(columns.reshape(-1, 6), y.ravel(), rcond=1e-6)[0])
+    without, left = y.var(axis=0).mean(), np.square(y - columns @ found).mean()
+    if (without - left) * y.size > least * left:
+        return found[:3]
+    return np.array([0.0, 0.0, min((g - GRAVITY_M_S2 for g in GRAVITIES_M_S2), key=lambda more: abs(more - found[2]))])
 
 
 def _conjugate_product(a: Float64[np.ndarray, "n 4"], b: Float64[np.ndarray, "n 4"]) -> Vectors:

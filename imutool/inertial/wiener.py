@@ -70,7 +70,7 @@ def denoised(
     settings: WienerSettings | None = None,
     recorded: Float64[np.ndarray, "n r"] | None = None,
     *,
-    of_poses: bool = False,
+    of_poses_to_hz: float | None = None,
 ) -> tuple[Float64[np.ndarray, "n k"], NoiseLeft]:
     """Signals without noise, by a Wiener filter in short times, and the noise that is left.
 
@@ -79,10 +79,10 @@ def denoised(
     units of it, the eigenvectors of the cross-spectrum with hardly more than noise go: what a gyro shows of a motion helps an
     accelerometer that hardly shows it.
     What stays is multiplied by 1 - noise / power of its own time: one gain for all of it would leave noise at rest, and take
-    from the motion. Of a motion by poses (`of_poses`) nothing stays that is not shared: their errors are not
-    white, and those of rounding change with the position.
+    from the motion. Of a motion by poses nothing stays that is not shared: their errors are not white, and those of rounding
+    change with the position. Nor does anything above `of_poses_to_hz`: what a simulation's samples do not show, a spline made.
     """
-    n, settings = len(x), settings or WienerSettings()
+    n, settings, of_poses = len(x), settings or WienerSettings(), of_poses_to_hz is not None
     line = _line(x)
     size = 4 * max(1, min(round(settings.short_time_s * rate_hz), n - 1) // 4)
     stft = ShortTimeFFT(hann(size, sym=False), size // OVERLAP, fs=rate_hz)
@@ -110,8 +110,8 @@ def denoised(
     around_each = (settings.short_time_parts, settings.short_time_parts, 1)
     here = uniform_filter(np.abs(parts) ** 2, around_each, mode="nearest")
     gain = np.where(here < MOSTLY * noise, 0.0, 1.0 - noise / np.maximum(here, 1e-300))
-    if of_poses and shared is not None:
-        gain *= ~_apart(shared, settings)[:, None]
+    if of_poses_to_hz is not None and shared is not None:
+        gain *= (~_apart(shared, settings) & (stft.f <= of_poses_to_hz)[:, None])[:, None]
     clean = stft.istft(np.moveaxis(gain * parts * std, 1, 2), k1=n + 2 * size, f_axis=0, t_axis=2)
     left = density * (std[:, 0] ** 2) * (gain**2).mean(axis=1) * noise[:, 0]
     most: Float64[np.ndarray, " k"] | float = np.inf

@@ -219,7 +219,7 @@ def _fitted(t_s: Times, y: Values, passes: int) -> tuple[Penalised, Times]:
         fit = samples.fit(min(FIRST_CUTOFF_HZ, samples.highest_hz) if is_first_of_several else None, near_hz)
         near_hz = fit.cutoff_hz if index else None
         size = np.linalg.norm(fit.residual(), axis=1)
-        local = percentile_filter(size, USUAL_PERCENTILE, window, mode="nearest")
+        local = percentile_filter(size, USUAL_PERCENTILE, window, mode="mirror")  # an end is not its own measure
         usual = np.maximum(np.maximum(local, np.median(size)) / USUAL_NORM, LEAST_NOISE)
         if index < passes - 1:
             weights = 1.0 / (1.0 + (size / (HUMP * usual)) ** 2)

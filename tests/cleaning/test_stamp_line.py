@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imutool.cleaning.rules.gaps import missing
-from imutool.cleaning.stamp_line import GAP_NS, read_stamps, restamped, usual_period
+from imutool.cleaning.stamp_line import GAP_NS, read_stamps, restamped, unrounded, usual_period
 
 PERIOD_NS = 5_000_321
 START_NS = 1_700_000_000_000_000_000
@@ -131,3 +131,16 @@ def test_bursts_of_a_second_are_no_fractions_of_another_unit() -> None:
         assert read_stamps(bursts).fraction == ""
     assert read_stamps(sampled()).fraction == ""
     assert read_stamps(START_NS + np.arange(2000) * 10**9).fraction == ""
+
+
+@pytest.mark.parametrize("grid_ns", [256, 1000])
+def test_stamps_that_are_rounded_lie_on_their_even_clock(grid_ns: int) -> None:
+    """256 ns: of seconds since 1970 as a float."""
+    even = START_NS + np.delete(np.arange(4000), [700, 701, 2500]) * 3_003_003
+    assert np.ptp(unrounded(even // grid_ns * grid_ns) - even) < 0.1 * grid_ns
+
+
+def test_stamps_that_are_not_even_stay() -> None:
+    late = START_NS + np.arange(4000) * 5_000_000 + np.random.default_rng(0).integers(0, 5000, 4000)
+    assert unrounded(late) is late
+    assert unrounded(late[:1]) is not None

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from support.rates import rates_from_poses
 
 from imutool.errors import DataError, NumericsError
-from imutool.inertial.kinematics import G_W, Trajectory, fit_trajectory
+from imutool.inertial.kinematics import G_W, Trajectory, fit_trajectory, gravity_error
 from imutool.recording import Poses
 
 START_NS = 1_700_000_000_000_000_123
@@ -180,3 +180,12 @@ def test_standard_gravity_points_down_and_cannot_be_changed_by_accident() -> Non
     np.testing.assert_array_equal(G_W, [0.0, 0.0, -9.81])
     with pytest.raises(ValueError, match="read-only"):
         G_W[2] = 0.0
+
+
+@pytest.mark.parametrize(("g", "noise", "told"), [(9.80665, 0.1, 9.80665), (9.81, 0.1, 9.81), (9.7803, 1e-3, 9.7803)])
+def test_a_simulators_gravity_is_a_usual_one_unless_its_samples_show_another(g: float, noise: float, told: float) -> None:
+    rng = np.random.default_rng(1)
+    R_wb = Rotation.from_euler("xyz", rng.uniform(-1.0, 1.0, (20_000, 3))).as_matrix()
+    y = np.einsum("nji,j->ni", R_wb, [0.0, 0.0, g + G_W[2]]) + [0.1, -0.2, 0.05] + noise * rng.normal(size=(20_000, 3))
+    off = gravity_error(R_wb, y, 36.0)
+    np.testing.assert_allclose(off, [0.0, 0.0, told + G_W[2]], atol=1e-12 if noise > 0.01 else 1e-4)

@@ -8,7 +8,8 @@ from scipy.interpolate import make_interp_spline
 
 from imutool.inertial.resampling import AS_GOOD, refined
 
-RATE_HZ, NOISE = 200.0, np.array([0.01, 0.01])
+RATE_HZ, NOISE, COUNT = 200.0, np.array([0.01, 0.01]), 400
+MOST = AS_GOOD * NOISE[0] / np.sqrt(COUNT)
 
 
 def motion(t_s: np.ndarray, fast_hz: float) -> np.ndarray:
@@ -21,15 +22,15 @@ def motion(t_s: np.ndarray, fast_hz: float) -> np.ndarray:
 def test_a_spline_through_refined_samples_is_the_motion(fast_hz: float) -> None:
     t_s, between_s = np.arange(2000) / RATE_HZ, np.arange(1000.3, 9000.0) / 1000.0
     x, truth = motion(t_s, fast_hz), motion(between_s, fast_hz)
-    finer = refined(x, NOISE)
+    finer = refined(x, NOISE, COUNT)
     grid_s = np.linspace(t_s[0], t_s[-1], len(finer))
     off, plain = (make_interp_spline(at_s, y, k=3)(between_s) - truth for at_s, y in ((grid_s, finer), (t_s, x)))
-    assert np.sqrt((off**2).mean(axis=0)).max() < AS_GOOD * NOISE[0]
-    assert np.sqrt((plain[:, 0] ** 2).mean()) > AS_GOOD * NOISE[0]  # so that something was to be done
+    assert np.sqrt((off**2).mean(axis=0)).max() < MOST
+    assert np.sqrt((plain[:, 0] ** 2).mean()) > MOST  # so that something was to be done
     every = (len(finer) - 1) // (len(x) - 1)
     assert finer[::every] == pytest.approx(x, abs=1e-9)
 
 
 def test_samples_that_a_spline_follows_stay() -> None:
     x = motion(np.arange(2000) / RATE_HZ, 5.0)
-    assert refined(x, NOISE) is x
+    assert refined(x, NOISE, COUNT) is x

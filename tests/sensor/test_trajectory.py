@@ -239,3 +239,15 @@ def test_a_handheld_recording_is_explained_by_its_own_poses(data: Path) -> None:
         accel.append(imu.accel - exact.specific_force())
     for left, largest in ((np.concatenate(gyro), 0.07), (np.concatenate(accel), 0.22)):
         assert rms(left - np.median(left, axis=0)) < largest
+
+
+def test_a_wild_start_is_dropped_and_makes_no_smoother_motion(path: Trajectory) -> None:
+    """A simulator that puts its body in place: its first poses are anywhere."""
+    t_ns = clock(path.start_ns, 100.0)
+    exact, rng = path.poses(t_ns), default_rng(2)
+    p_wb, q_wb_wxyz = exact.p_wb.copy(), exact.q_wb_wxyz.copy()
+    p_wb[:6] += np.outer(np.arange(6, 0, -1), [0.3, -0.2, 1.0])
+    q_wb_wxyz[:6] = Rotation.random(6, rng).as_quat(scalar_first=True)
+    whole, sound = (smooth_motion(one) for one in (Poses(t_ns, p_wb, q_wb_wxyz), exact))
+    assert whole.glitches >= 6
+    assert min(whole.stretches[0].cutoff_hz) > 0.9 * min(sound.stretches[0].cutoff_hz)

@@ -155,10 +155,9 @@ def axis_squares(found: Fit) -> Axes:
     return np.asarray(sum(((r - log.constants * b)[log.rows(found.part)] ** 2).sum(axis=0) for log, r, b in each))
 
 
-def leaves_slow_motion(found: Fit, sensor: str, gain: float) -> bool:
-    """Whether a fit leaves much of what an effect gains, on its sensor and where a body moves."""
-    part, settings = found.logs[0].pair.signals[sensor], found.logs[0].pair.settings.search
-    return float(_slow_squares(found)[part].sum()) > settings.hysteresis_leaves * gain
+def leaves_slow_motion(found: Fit, sensor: str, squares: float) -> bool:
+    """Whether a fit leaves more than some squares on a sensor, where a body moves."""
+    return float(_slow_squares(found)[found.logs[0].pair.signals[sensor]].sum()) > squares
 
 
 def _slow_squares(found: Fit) -> Axes:

@@ -15,13 +15,14 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Bool, Float64
+from imutool.cleaning.stamp_line import unrounded
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair, split
 from imutool.diagnosis.estimation.timestamps import without_jitter
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError
 from imutool.inertial.correlation import cross_correlation
-from imutool.inertial.kinematics import G_W, Motion, fit_trajectory
-from imutool.inertial.resampling import refined
+from imutool.inertial.kinematics import G_W, Motion, fit_trajectory, gravity_error
+from imutool.inertial.resampling import refined, refinement
 from imutool.inertial.stationary import is_white, nothing_but_noise, white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.inertial.wiener import NoiseLeft, denoised, recorded_at
@@ -170,19 +171,20 @@ def _simulated(
     noise = white_noise(samples)
     t_sim = without_jitter(t_sim, samples, settings.timestamps)
     period_s = float(np.median(np.diff(t_sim)))
-    ideal = _by_poses(sim, samples, noise, 1.0 / period_s, settings)
+    of_real = white_noise(np.concatenate([real.imu.gyro, real.imu.accel], axis=1)), len(real.imu)
+    ideal = _by_poses(sim, samples, noise, 1.0 / period_s, of_real, settings)
     if ideal is not None:
-        t_s = seconds(sim.truth.t_ns[:1], start_ns + nanoseconds(shift_s))[0] + ideal.t_s
+        t_s = seconds(unrounded(sim.truth.t_ns)[:1], start_ns + nanoseconds(shift_s))[0] + ideal.t_s
         ideal = replace(ideal, t_s=t_s, channels=_channels(real, start_ns + np.round(t_s * 1e9).astype(np.int64)))
         witnesses = recorded_at(sim.imu, t_s, start_ns + nanoseconds(shift_s)), recorded_at(real.imu, t_s, start_ns, ideal.gyro)
-        ideal, left = _shared_motion(ideal, 1.0 / period_s, np.concatenate(witnesses, axis=1), settings.alignment)
+        ideal, left = _shared_motion(ideal, 0.5 / period_s, np.concatenate(witnesses, axis=1), settings.alignment)
         return ideal, np.zeros(6), None if own_poses else left
     t_s = np.linspace(t_sim[0], t_sim[-1], round((t_sim[-1] - t_sim[0]) / period_s) + 1)  # on the samples, if they are even
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
     recorded = None if own_poses else recorded_at(real.imu, t_s, start_ns, even[:, :3])  # shares no errors of poses either
     clean, left = denoised(even, 1.0 / period_s, settings.alignment, recorded)
     noise = np.minimum(noise, left.most)  # a vibration looks like white noise, and a recording shares it
-    clean = refined(clean, white_noise(np.concatenate([real.imu.gyro, real.imu.accel], axis=1)))
+    clean = refined(clean, *of_real)
     t_s = np.linspace(t_s[0], t_s[-1], len(clean))
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
     t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
@@ -195,15 +197,17 @@ def _by_poses(
     samples: Float64[np.ndarray, "m 6"],
     noise: Float64[np.ndarray, "6"],
     rate_hz: float,
+    of_real: tuple[Float64[np.ndarray, "6"], int],
     settings: DiagnoseSettings,
 ) -> IdealMotion | None:
-    """Ideal motion of the simulation's own poses.
+    """Ideal motion of the simulation's own poses, so dense that a spline through it is exact for the recording's noise.
 
-    None unless the simulated samples are that motion plus white noise and a constant.
+    None unless the simulated samples are that motion plus white noise and a constant. `of_real` are noise and number of the
+    recording's samples.
     """
     if not sim.truths:
         return None
-    poses, own, t_ns = sim.truth, settings.alignment, sim.imu.t_ns
+    poses, own, t_ns = replace(sim.truth, t_ns=unrounded(sim.truth.t_ns)), settings.alignment, sim.imu.t_ns
     holes = np.diff(poses.t_ns).max() > 1e9 * settings.split.gap_periods * poses.period_s
     rows = (t_ns >= poses.t_ns[0]) & (t_ns <= poses.t_ns[-1])
     if holes or poses.period_s * own.poses_hz > 1.0 or rows.mean() < own.poses_share:
@@ -212,10 +216,11 @@ def _by_poses(
     there = trajectory.at(t_ns[rows])
     residual = samples[rows] - np.concatenate([there.omega_b, there.specific_force()], axis=1)
     R_wb = rotation_matrices(there)
-    off = _gravity_error(R_wb, residual[:, 3:], settings.search.observable_squares)
+    off = gravity_error(R_wb, residual[:, 3:], settings.search.observable_squares)
     residual[:, 3:] -= np.einsum("nji,j->ni", R_wb, off)
     if not is_white(residual - residual.mean(axis=0), noise, LEAST_NOISE, own.coarse_bands, own.coarse_factor, own.line_chance):
         return None
+    rate_hz *= refinement(np.concatenate([there.omega_b, there.specific_force()], axis=1), *of_real)
     t_ns = poses.t_ns[0] + np.arange(int(poses.duration_s * rate_hz) + 1) * round(1e9 / rate_hz)
     motion = trajectory.at(t_ns[t_ns <= poses.t_ns[-1]])
     t_s = np.arange(len(motion.p_wb)) * round(1e9 / rate_hz) * 1e-9
@@ -223,22 +228,13 @@ def _by_poses(
 
 
 def _shared_motion(
-    ideal: IdealMotion, rate_hz: float, witnesses: Float64[np.ndarray, "n r"], settings: AlignmentSettings
+    ideal: IdealMotion, most_hz: float, witnesses: Float64[np.ndarray, "n r"], settings: AlignmentSettings
 ) -> tuple[IdealMotion, NoiseLeft]:
-    """Motion of poses at the frequencies that an IMU shares, and the noise that is left in it."""
+    """Motion of poses at the frequencies, up to `most_hz`, that an IMU shares, and the noise that is left in it."""
     noisy = np.concatenate([ideal.gyro, ideal.accel], axis=1)
-    clean, left = denoised(noisy, rate_hz, settings, witnesses, of_poses=True)
+    clean, left = denoised(noisy, ideal.rate_hz, settings, witnesses, of_poses_to_hz=most_hz)
     alpha = ideal.alpha - np.asarray(make_interp_spline(ideal.t_s, noisy[:, :3] - clean[:, :3], k=5)(ideal.t_s, 1))
     return replace(ideal, gyro=clean[:, :3], accel=clean[:, 3:], alpha=alpha), left
-
-
-def _gravity_error(R_wb: Float64[np.ndarray, "n 3 3"], y: Float64[np.ndarray, "n 3"], least: float) -> Float64[np.ndarray, "3"]:
-    """By how much a simulator's own gravity differs, beside a constant of the body; zero if it gains fewer squares of noise."""
-    R_wb, y = (x[:: len(y) // 20_000 + 1] for x in (R_wb, y))
-    columns = np.concatenate([R_wb.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R_wb.shape)], axis=2)
-    found = np.asarray(np.linalg.lstsq(columns.reshape(-1, 6), y.ravel(), rcond=1e-6)[0])
-    without, left = y.var(axis=0).mean(), np.square(y - columns @ found).mean()
-    return found[:3] if (without - left) * y.size > least * left else np.zeros(3)
 
 
 def rotation_matrices(poses: Poses | Motion) -> Float64[np.ndarray, "n 3 3"]:

@@ -6,11 +6,14 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
+from scipy.signal import butter, sosfiltfilt
 
 from imutool.array_types import Float64
 from imutool.diagnosis.signals.ideal_signal import SignalPair, stacked
 from imutool.diagnosis.signals.quantities import continuous, unwrapped
 from imutool.errors import LogError
+from imutool.inertial.stationary import white_noise
 from imutool.mcap_io.fields import Fields, decoder_of
 from imutool.mcap_io.log import Log
 from imutool.recording import seconds
@@ -20,6 +23,7 @@ JOINT_UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
 SPEEDS = ("twist.twist.linear.x", "twist.twist.angular.z")
 LEAST_MOVED = 1e-3  # rad or m: a joint that moves less shows nothing of its dynamics
 LEAST_EFFORTS = 0.5  # of the joints, that have efforts where efforts are compared
+LEAST_RATES, SLOWER_HZ, RATE_ERROR = 100, 0.1, 0.003  # samples; of a drift that integration makes; share of a motion
 DRIVES = 0.05  # of a vehicle's speed or turning, that a wheel makes
 
 
@@ -77,12 +81,36 @@ def joint_pairs(
     if moving and len(driven) >= LEAST_EFFORTS * len(joints):
         yield _efforts(topic, moving, mine, other)
         return
-    for path in both:
+    known = rates(mine, other)
+    for path in (path for path in both if path not in known):
         kind = "positions" if path.startswith("position") else "number"
         effort = mine.get(path.replace("position", "effort"))
         state = {"effort": effort} if kind == "positions" and effort is not None else {}
         pair = SignalPair.of_fields(mine[path], other[path], f"{topic}.{path}")
         yield unwrapped(replace(pair, kind=kind, state=state, units=(JOINT_UNITS[path.partition("[")[0]],)))
+
+
+def rates(mine: Mapping[str, Fields], other: Mapping[str, Fields]) -> list[str]:
+    """Recorded velocities that are the rates of positions which both logs hold."""
+    found = [(path, path.replace("velocity", "position")) for path in mine if path.startswith("velocity") and path in other]
+    return [path for path, of in found if of in mine and of in other and _is_rate(mine[path], mine[of])]
+
+
+def _is_rate(velocity: Fields, position: Fields) -> bool:
+    """Whether a velocity is the rate of a position at the same stamps, up to a sample late.
+
+    What its integral leaves of the position, but for white noise, is compared with the position's motion.
+    """
+    if len(position) < LEAST_RATES or not np.array_equal(velocity.t_ns, position.t_ns):
+        return False
+    t_s = seconds(position.t_ns, int(position.t_ns[0]))
+    period_s = float(np.median(np.diff(t_s)))
+    slow = butter(2, min(2.0 * SLOWER_HZ * period_s, 0.5), "highpass", output="sos")
+    gone = cumulative_trapezoid(velocity.values, t_s, initial=0)
+    q, left, v = sosfiltfilt(slow, np.stack([position.values, position.values - gone, velocity.values], axis=1), axis=0).T
+    left = left - float(np.clip(left @ v / max(v @ v, 1e-300), -period_s, period_s)) * v
+    noise = float(white_noise(left[:, None])[0])
+    return bool(left.var() - noise**2 < RATE_ERROR**2 * q.var())
 
 
 def _efforts(topic: str, moving: Sequence[str], mine: Mapping[str, Fields], other: Mapping[str, Fields]) -> SignalPair:

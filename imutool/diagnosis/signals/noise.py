@@ -130,9 +130,10 @@ def above_model_error(log: WhitenedLog, selection: Selection) -> tuple[Selection
         return selection, []
     size, of = np.array(pair.scale().size), _changes if pair.band_hz is None else _sizes
     sizes = np.stack([of(log, selection, selected) for selected in selection.selected])
-    enough = INTERPOLATION_ERROR * size
+    of_size, of_largest = INTERPOLATION_ERROR, pair.settings.search.model_error
     if pair.band_hz is not None:
-        enough = np.maximum(LEARNT_ERROR * size, np.sqrt(SMALL_GAIN) * sizes.max(axis=0))
+        of_size, of_largest = LEARNT_ERROR, SMALL_GAIN
+    enough = np.maximum(of_size * size, np.sqrt(of_largest) * sizes.max(axis=0))
     kept, small = list[SelectedEffect](), list[SelectedEffect]()
     for selected, own in zip(selection.selected, sizes, strict=True):
         (kept if (own >= enough).any() else small).append(selected)

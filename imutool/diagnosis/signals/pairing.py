@@ -15,7 +15,7 @@ import numpy as np
 from imutool.diagnosis.estimation.aligned_log import ClockDifference
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair, stacked
-from imutool.diagnosis.signals.joints import JOINTS, SPEEDS, by_joint, joint_pairs, joint_remarks, wheel_pair
+from imutool.diagnosis.signals.joints import JOINTS, SPEEDS, by_joint, joint_pairs, joint_remarks, rates, wheel_pair
 from imutool.diagnosis.signals.lag import is_copy, on_recorded_clock
 from imutool.diagnosis.signals.log_fields import ELSEWHERE, GNSS, MAGNETIC, RANGE, TEMPERATURE, LogFields, read_both
 from imutool.diagnosis.signals.quantities import field_vectors, in_one_unit, in_radians, in_si, is_air, metres, unwrapped
@@ -70,13 +70,24 @@ def paired(real: Location, sim: Location, clock: ClockDifference | None = None) 
     pairs.sort(key=lambda pair: pair.kind == "number")  # a sort keeps the log's order otherwise
     untried = [name for pair in pairs[MOST_COMPARED:] for name in pair.names]
     pairs = pairs[:MOST_COMPARED]
-    remarks += _listed("The same in both logs", same) + _listed(f"Not compared, for at most {MOST_COMPARED} are", untried)
+    rate_of = _listed("The rates of recorded positions, which are compared", _rates(own, other, topics, pairs))
+    remarks += (
+        rate_of + _listed("The same in both logs", same) + _listed(f"Not compared, for at most {MOST_COMPARED} are", untried)
+    )
     return Pairing(tuple(pairs), _drivers(own, pairs), tuple(remarks))
 
 
 def _listed(what: str, names: list[str]) -> list[str]:
     more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
     return [f"{what}: {', '.join(names[:LISTED])}{more}"] if names else []
+
+
+def _rates(real: LogFields, sim: LogFields, topics: Mapping[str, str], pairs: Sequence[SignalPair]) -> list[str]:
+    """Velocities of joints that are not compared, because they say no more than a position that is."""
+    compared = {name for pair in pairs for name in pair.names}
+    joints = [topic for topic in topics if real.schemas[topic] == JOINTS]
+    found = (f"{topic}.{path}" for topic in joints for path in rates(*_joints(real, sim, topic, topics[topic])))
+    return [name for name in found if name.replace(".velocity", ".position") in compared]
 
 
 def _wheels(real: LogFields, sim: LogFields, topics: Mapping[str, str]) -> dict[str, tuple[SignalPair, list[str]]]:

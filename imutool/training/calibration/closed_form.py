@@ -143,8 +143,8 @@ def solve(
         rest[:, columns] = own[:, :3]
     P = torch.linalg.inv(H)
     std = P.diagonal()[known:].reshape(own.shape)[:, :3].sqrt()
-    of_matrix = _matrix_by_scatter(sensor, map(linearised, sets), W, _apart(own, turns)) if matrix else (W, P[:0, :0])
-    return Solution(*of_matrix, rest[:, columns].clone(), std)
+    W, covariance = _matrix_by_scatter(sensor, map(linearised, sets), W, _apart(own, turns)) if matrix else (W, P[:0, :0])
+    return Solution(W, covariance, rest[:, columns].clone(), std)
 
 
 class _Linearised(NamedTuple):

@@ -19,6 +19,9 @@ from imutool.diagnosis.estimation.trial.model_error import (
     OF_MOTION,
     LowPassError,
     below_model_error,
+    below_reference_error,
+    is_over_at_once,
+    is_rim,
     with_low_pass_error,
 )
 from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection
@@ -26,6 +29,7 @@ from imutool.diagnosis.reference.coverage import without_unseen_offset
 from imutool.diagnosis.settings import DiagnoseSettings, SearchSettings
 from imutool.recording import Recording
 from imutool.sensor import catalogue
+from imutool.sensor.effects import gyro_bias_drift
 
 SETTINGS = SearchSettings()
 FAST_HZ, RATE_HZ, DURATION_S = 2000, 250, 24.0
@@ -70,6 +74,51 @@ def test_a_small_filter_beside_a_low_pass_is_what_another_form_leaves(name: str,
         names = {key: key.partition(":")[0], name: name}
         found = below_model_error({key: 1.0, name: small}, SETTINGS, denoised=False, poses=False, names=names)
         assert found == ({name} if hidden else set())
+
+
+@pytest.mark.parametrize(("name", "hidden"), [("gyro_delay", True), ("gyro_bias_step", False)])
+def test_a_small_delay_beside_a_hysteresis_is_a_turn_between_two_samples(name: str, hidden: bool) -> None:
+    small = {"gyro_hysteresis": 1.0, name: 0.5 * SETTINGS.model_error_resonance}
+    assert below_model_error(small, SETTINGS, denoised=False, poses=False) == ({name} if hidden else set())
+
+
+@pytest.mark.parametrize(("name", "below"), [("gyro_scale", True), ("gyro_bias_drift", False)])
+def test_what_moves_with_the_body_is_more_than_the_rounding_of_a_simulation(name: str, below: bool) -> None:
+    felt = planted.rich()
+    now = fit([planted.weighed(planted.pair(felt))], ())
+    (effect,) = catalogue.diagnosed([name])
+    gyro = (planted.ideal(felt)[:, :3] - planted.ideal(felt)[:, :3].mean(axis=0)) / planted.NOISE[0]
+    least = SETTINGS.model_error_reference * float((gyro[now.logs[0].rows("fitted")] ** 2).sum())
+    assert below_reference_error(effect, 0.99 * least, now) == below
+    assert not below_reference_error(effect, 1.01 * least, now)
+
+
+@pytest.mark.parametrize(("name", "rim"), [("accel_scale", True), ("accel_bias_step", False), ("gyro_scale", False)])
+def test_a_name_that_explains_little_of_a_far_larger_misfit_is_its_rim(name: str, rim: bool) -> None:
+    """The force follows the cube of the rate, which no effect does: whatever moves as well explains some of it."""
+    felt = planted.rich()
+    added = np.concatenate([np.zeros_like(felt.gyro), 0.5 * felt.gyro[:, [1, 2, 0]] ** 3], axis=1)
+    now = fit([planted.weighed(planted.pair(felt, added=added))], ())
+    (effect,) = catalogue.diagnosed([name])
+    left = now.objective - now.numbers
+    assert is_rim(effect, 0.02 * left, now) == rim
+    assert not is_rim(effect, 0.5 * left, now)
+
+
+@pytest.mark.parametrize(
+    ("name", "theta", "over"),
+    [
+        ("accel_bias_drift", [-8.0, 5.0, 1.0, 0.14], True),
+        ("accel_bias_drift", [-0.8, 0.5, 0.1, 2.0], False),
+        ("accel_bias_drift", [30.0, 0.0, 0.0, 5000.0], False),  # of which 24 s show 0.14 m/s²
+        ("accel_bias_step", [-8.0, 5.0, 1.0, 0.14], False),
+    ],
+)
+def test_a_drift_that_was_over_before_the_first_sample_has_no_size(name: str, theta: list[float], over: bool) -> None:
+    effect = planted.acting({name: theta})[0][0]
+    if effect.reached is not None:
+        effect = next(gyro_bias_drift.within([effect], planted.DURATION_S))
+    assert is_over_at_once(effect, np.array(theta), SETTINGS.implausible_factor) == over
 
 
 def test_what_does_not_follow_the_motion_is_told_however_faint() -> None:

@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from scipy.stats import norm
 from support import planted
 
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.significance import Scatter, log_p_value, scatter
 from imutool.diagnosis.estimation.trial import unseen_time
-from imutool.diagnosis.estimation.trial.unseen_time import first_refuted
+from imutool.diagnosis.estimation.trial.unseen_time import first_refuted, prediction_p_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 
 FELT = planted.shaken(duration_s=45.0)
@@ -149,3 +150,11 @@ def test_what_the_motion_does_not_show_stays_unsure() -> None:
     std = scatter([log], found, "all", BLOCK_S).std["gyro_scale"]
     assert (std[:2] > 0.1).all()
     assert std[2] < 1e-3
+
+
+def test_a_prediction_is_as_sure_as_what_has_no_explanation_lets_it_be() -> None:
+    """Sixteen times the squares of noise are left: a fourth of the deviations."""
+    blocks = np.tile([1.0, 1.0], (40, 1)) * 1.6
+    assert prediction_p_value(blocks, 1.0) == pytest.approx(float(norm.sf(8.0)))
+    assert prediction_p_value(blocks, 16.0) == pytest.approx(float(norm.sf(2.0)))
+    assert prediction_p_value(0.0 * blocks, 1.0) == 1.0

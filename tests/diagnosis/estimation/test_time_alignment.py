@@ -17,8 +17,9 @@ from imutool.diagnosis.estimation.aligned_log import Pair, split
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.time_alignment import same_motion, with_simulation, with_truth
 from imutool.errors import DataError
+from imutool.inertial.resampling import AS_GOOD
 from imutool.inertial.wiener import wiener_filter
-from imutool.recording import Recording, Scalars
+from imutool.recording import Poses, Recording, Scalars
 
 KEPT = 0.01  # of a signal below a tenth of Nyquist that the filter may change
 NOISE_LEFT = 0.05  # of the noise's size above the signal's band: a band that stands out by chance goes as well
@@ -138,6 +139,44 @@ def test_rounding_errors_of_the_simulations_poses_are_no_motion() -> None:
     f_hz, power = periodogram(pair.ideal.accel, pair.ideal.rate_hz, "hann", axis=0)
     fast = np.sqrt(power[(f_hz > 15.0) & (f_hz < 50.0)].sum(axis=0) * f_hz[1])
     assert (fast < 1e-4).all()  # 3e-3 as they are
+
+
+def test_float_stamps_of_the_simulations_poses_are_no_motion() -> None:
+    """Seconds since 1970 as a float have steps of 238 ns, which second derivatives show as lines."""
+    real, sim = logs(with_poses=True)
+    poses = sim.truth.rows(slice(None, None, 2))  # at 100 Hz
+    p_wb = poses.p_wb + np.outer(planted.clock(24.0), [20.0, 0.0, 0.0])  # fast, so that the lines are loud
+    moved = [replace(poses, p_wb=p_wb, t_ns=t_ns) for t_ns in (poses.t_ns, poses.t_ns // 256 * 256)]
+    pairs = [with_simulation(real, replace(sim, truths={"/ground_truth/pose": one}))[0] for one in moved]
+    assert not any(pair.sim_noise.any() for pair in pairs)  # the poses
+    even, rounded = (pair.ideal.sample(pair.stamp_s, pair.stamp_s).accel[50:-50] for pair in pairs)
+    assert rms(even - rounded) < 1e-4
+
+
+def test_a_spline_through_a_slow_simulation_is_exact_for_the_noise_of_a_fast_recording() -> None:
+    """Motion at a fifth of the simulation's rate: a cubic spline loses 0.4 % of it, as a filter does."""
+    t_s, sim_s = np.arange(8000) / 400.0, np.arange(2001) / 100.0
+
+    def turn(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        angle = sum(np.sin(2.0 * np.pi * f * t + f) / (f * 20.0) for f in (1.3, 7.1, 19.7))
+        rate = sum(2.0 * np.pi * np.cos(2.0 * np.pi * f * t + f) / 20.0 for f in (1.3, 7.1, 19.7))
+        return np.outer(angle, [0.0, 0.0, 1.0]), np.outer(rate, [0.0, 0.0, 1.0])
+
+    def samples(t: np.ndarray) -> np.ndarray:
+        return np.concatenate([turn(t)[1], np.tile([0.0, 0.0, 9.81], (len(t), 1))], axis=1)
+
+    noise = np.random.default_rng(0).normal(size=(len(t_s), 6)) * [2e-3] * 6
+    t_ns = planted.START_NS + np.round(sim_s * 1e9).astype(np.int64)
+    q_wb_wxyz = np.ascontiguousarray(Rotation.from_rotvec(turn(sim_s)[0]).as_quat(scalar_first=True))
+    poses = Poses(t_ns, np.zeros((len(sim_s), 3)), q_wb_wxyz)
+    real = planted.recording("real", t_s, samples(t_s) + noise)
+    (pair,) = with_simulation(real, planted.recording("sim", sim_s, samples(sim_s), poses=poses))
+    off = pair.ideal.sample(pair.stamp_s, pair.stamp_s).gyro - samples(pair.stamp_s)[:, :3]
+    squares = float((off[400:-400] ** 2).sum()) / 2e-3**2
+    assert squares < 2.0 * AS_GOOD**2
+    f_hz, power = periodogram(pair.ideal.gyro[:, 2], pair.ideal.rate_hz, "hann")
+    assert pair.ideal.rate_hz > 150.0
+    assert power[f_hz > 55.0].sum() < 1e-8 * power.sum()  # a spline between poses has images of the motion there
 
 
 def test_poses_do_not_stand_in_for_impacts_that_they_are_too_slow_to_hold() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from scipy.signal import lfilter
 from support.robot_cases.log import write
 
 from imutool.diagnosis.diagnose import diagnose
@@ -67,6 +68,31 @@ def test_a_joint_of_one_log_alone_is_left_out_and_the_others_are_paired_by_name(
     assert np.allclose(positions["/joint_states.position[2]"], 1.1 * knee, atol=EXACT)
     assert "Joints of /joint_states: [0] finger, [1] hip, [2] knee" in pairing.remarks
     assert any("Only the recording has the joints finger" in remark for remark in pairing.remarks)
+
+
+@pytest.mark.parametrize(
+    ("name", "compared"),
+    [("central", False), ("backward", False), ("half as large", True), ("filtered", True), ("alone", True)],
+)
+def test_a_velocity_is_compared_unless_it_is_the_rate_of_a_position_that_is(name: str, compared: bool, tmp_path: Path) -> None:
+    hip = wave(1) + 1e-4 * np.random.default_rng(0).normal(size=len(T))
+    rate = np.gradient(hip, T)
+    speed = {
+        "central": rate,
+        "backward": np.append(0.0, np.diff(hip) / 0.01),
+        "half as large": 0.5 * rate,
+        "filtered": lfilter([0.05], [1.0, -0.95], rate),
+        "alone": rate,
+    }[name]
+    position = np.full(len(T), np.nan) if name == "alone" else hip
+    real = {"/joint_states": (JOINTS, T, np.stack([position, speed, np.zeros(len(T))], axis=1))}
+    sim = {"/joint_states": (JOINTS, T, joints(1.1 * wave(1)))}
+    pairing = logged(tmp_path, real, sim, ("hip",), ("hip",))
+    names = {pair.name for pair in pairing.pairs}
+    assert ("/joint_states.velocity[0]" in names) == compared
+    assert ("/joint_states.position[0]" in names) == (name != "alone")
+    told = "The rates of recorded positions, which are compared: /joint_states.velocity[0]"
+    assert (told in pairing.remarks) == (not compared)
 
 
 @pytest.mark.parametrize("effort", [0.0, np.nan])

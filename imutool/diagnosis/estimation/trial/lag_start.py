@@ -113,12 +113,12 @@ def with_delay_of_accel(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[E
         if len(both) == 2 and effect.name in (*LOW_PASSES, HYSTERESIS) and effect.sensors == ("accel",):
             start = np.array([0.0 if effect.name == HYSTERESIS else -Design.of(effect, theta).lag_s])
             late = (*now.chosen[:k], *now.chosen[k + 1 :], *((of, start) for of in both))
-            least = bic(now) - logs[0].pair.settings.search.clearly_better
+            settings = logs[0].pair.settings.search
             trial = fit(logs, late, near=now, give_up_above=now.objective)
-            if bic(trial) >= least:
+            if bic(trial) >= bic(now) - settings.clearly_better:
                 return now
-            gain = fit(logs, late[:-2], near=now).objective - trial.objective
-            return now if effect.name == HYSTERESIS and leaves_slow_motion(trial, "accel", gain) else trial
+            most = settings.hysteresis_leaves * (fit(logs, late[:-2], near=now).objective - trial.objective)
+            return now if effect.name == HYSTERESIS and leaves_slow_motion(trial, "accel", most) else trial
     return now
 
 

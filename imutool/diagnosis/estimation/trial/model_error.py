@@ -12,6 +12,7 @@ import numpy as np
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit
 from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.estimation.noise_estimate import leaves_slow_motion
 from imutool.diagnosis.estimation.observability import LOW_PASSES, STEADY, WANDER
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.settings import SearchSettings
@@ -19,6 +20,7 @@ from imutool.sensor.effect import Effect, Theta
 
 CLOCKS = (*STEADY, WANDER)
 FILTERS = (*LOW_PASSES, "mount_resonance", "gyro_delay", "gyro_hysteresis", "accel_hysteresis")
+SIMPLIFIED = ("mount_resonance", "gyro_hysteresis", "accel_hysteresis")  # a mass moves, too; motion turns between two samples
 FOLLOWING = frozenset({*CLOCKS, *FILTERS})
 OF_MOTION = FOLLOWING | {
     *(f"{sensor}_{kind}" for sensor in ("gyro", "accel") for kind in ("scale", "misalignment", "scale_asymmetry", "quadratic")),
@@ -48,7 +50,7 @@ def below_model_error(
     simulation.
     """
     allowed = settings.model_error_denoised if denoised else settings.model_error
-    simplified = {"mount_resonance": settings.model_error_resonance}  # models that are simpler than what they stand for
+    simplified = dict.fromkeys(SIMPLIFIED, settings.model_error_resonance)
     of_filters = dict.fromkeys(LOW_PASSES, settings.model_error_low_pass)
     of_filters |= dict.fromkeys(CLOCKS, settings.model_error_clock) if poses else {}
 
@@ -69,6 +71,47 @@ def below_model_error(
 def of_motion(effect: Effect) -> bool:
     """Whether an effect but a low-pass follows the motion, as the error of one does."""
     return effect.name in OF_MOTION - {*LOW_PASSES} or (effect.kind == "unknown" and not effect.of_time)
+
+
+def below_reference_error(effect: Effect, gain: float, found: Fit) -> bool:
+    """Whether an effect that follows the motion is below the error of a simulation itself.
+
+    It interpolates, integrates and rounds, so its motion errs by a share, however little noise a recording has.
+    """
+    if not _follows_body(effect, found) or not all(log.pair.exact for log in found.logs):
+        return False
+    motion = 0.0
+    for log in found.logs:
+        ideal = expected(log.pair, ())
+        squares = (log.whiten(ideal - ideal.mean(axis=0))[log.rows(found.part)] ** 2).sum(axis=0)
+        motion += sum(float(squares[part].sum()) for name, part in log.pair.signals.items() if name in effect.sensors)
+    return gain < found.logs[0].pair.settings.search.model_error_reference * motion
+
+
+def is_rim(effect: Effect, gain: float, found: Fit) -> bool:
+    """Whether an effect is the rim of a far larger misfit, of slow motion on its sensors.
+
+    Whatever moves with the body explains some of such a misfit, so a name for it would be wrong.
+    """
+    least = found.logs[0].pair.settings.search.rim_leaves * gain
+    return _follows_body(effect, found) and all(leaves_slow_motion(found, sensor, least) for sensor in effect.sensors)
+
+
+def _follows_body(effect: Effect, found: Fit) -> bool:
+    """Whether an effect of an IMU follows the motion of its body."""
+    of_body = of_motion(effect) or effect.name in FILTERS
+    return of_body and bool(effect.sensors) and all(isinstance(log.pair, Pair) for log in found.logs)
+
+
+def is_over_at_once(effect: Effect, theta: Theta, factor: float) -> bool:
+    """Whether a drift is far larger than plausible, over before the first sample.
+
+    Any size of it fits what the first samples show of its tail.
+    """
+    if effect.reached is None:
+        return False
+    size = np.abs(theta[:-1]) * effect.reached(float(theta[-1]))
+    return bool((size > factor * np.array(effect.plausible)[:-1]).any())
 
 
 class LowPassError(NamedTuple):

@@ -26,6 +26,9 @@ from imutool.diagnosis.estimation.trial.model_error import (
     FOLLOWING,
     LowPassError,
     below_model_error,
+    below_reference_error,
+    is_over_at_once,
+    is_rim,
     of_motion,
     with_low_pass_error,
 )
@@ -153,6 +156,8 @@ class Trial:
             every = with_left(None)
             below = frozenset(key for key in hidden(every) if not self._shown_elsewhere(key, every, whole))
         below |= {one.effect.key for one in verdicts if self._may_be_error(one.effect, whole)}
+        below |= {one.effect.key for one in verdicts if below_reference_error(one.effect, one.gain, whole)}
+        below |= {one.effect.key for one in verdicts if exact and is_rim(one.effect, one.gain, whole)}
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in below else verdict for verdict in verdicts]
 
     def _shown_elsewhere(self, key: str, gains: Mapping[str, float], whole: Fit) -> bool:
@@ -185,7 +190,11 @@ class Trial:
         no_answer = (
             no_answer
             or is_coloured_noise(effect, theta, whole)
-            or (effect.name in HYSTERESES and leaves_slow_motion(whole, effect.sensors[0], gain[0]))
+            or is_over_at_once(effect, theta, self.settings.implausible_factor)
+            or (
+                effect.name in HYSTERESES
+                and leaves_slow_motion(whole, effect.sensors[0], self.settings.hysteresis_leaves * gain[0])
+            )
         )
         if no_answer or has_no_size(effect, theta, std, curve=(curve := isinstance(effect.forward, SplineCurve))):
             return None
