@@ -178,7 +178,7 @@ def export(
 def new_converter(
     name: Annotated[str, typer.Argument(help="Name on the command line, such as my_logger.")],
     folder: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="DIR", help="New folder; by default imutool-NAME.")
+        Path | None, typer.Option("--output", "--folder", "-o", metavar="DIR", help="New folder; by default imutool-NAME.")
     ] = None,
 ) -> None:
     """Write a template of a converter, with a test, as a package of its own."""
