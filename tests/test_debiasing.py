@@ -269,7 +269,7 @@ def test_what_was_checked_stands_in_the_log_and_in_the_report(source: Path, mode
         assert json.loads(metadata(out)[-1][1]["verified"]) == verified._asdict()
         assert verified.mode == check
         assert (verified.chunks_checked == verified.chunks) == (check == "all")
-    with pytest.raises(ConfigError, match="check: 'most'"):
+    with pytest.raises(ConfigError, match="check: unknown mode 'most'"):
         debias(source, tmp_path / "out.mcap", model=model_file, check="most")
 
 
@@ -540,7 +540,7 @@ def test_models_on_the_command_line_are_for_all_or_for_a_topic(tmp_path: Path, m
     assert assigned(["/imu0=a", "/imu1=b=c", "d"]) == {"/imu0": "a", "/imu1": "b=c", "": "d"}
     assert assigned(["lr=0.1/m.safetensors"]) == {"": "lr=0.1/m.safetensors"}
     for words, said in (
-        (["a", "b"], "a and b for all IMUs"),
+        (["a", "b"], "a and b are both given for all IMUs"),
         (["/imu0=a", "/imu0=b"], "a and b for /imu0"),
         (["=a"], "expected MODEL or TOPIC=MODEL"),
         (["/imu0="], "expected MODEL or TOPIC=MODEL"),

@@ -329,7 +329,7 @@ def test_all_finds_the_damage_that_the_others_pass_on(source: Path, tmp_path: Pa
     with pytest.raises(LogError, match="the chunk at byte"):
         rewrite(source, tmp_path / "all.mcap", [Half("/imu0")], metadata={}, check="all")
     assert not (tmp_path / "all.mcap").exists()
-    with pytest.raises(ConfigError, match="check: 'some'; expected all, imu, none"):
+    with pytest.raises(ConfigError, match="check: unknown mode 'some'; expected all, imu, none"):
         rewrite(source, tmp_path / "some.mcap", [], metadata={}, check="some")
 
 

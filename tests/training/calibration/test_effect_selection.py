@@ -234,7 +234,7 @@ def test_what_a_planar_motion_cannot_show_stays_at_its_prior_and_is_named(flight
         if parameter.name in ("xz", "yz"):  # what turning about z adds to the others
             assert abs(value - planted) < 0.1 * abs(planted), parameter.name
         else:
-            assert abs(value) < 0.2 * width, parameter.name
+            assert abs(value) < NEAR_PRIOR * width, parameter.name
 
 
 def test_named_effects_are_fitted_whether_or_not_the_logs_support_them(flights: list[Recording]) -> None:
