@@ -541,7 +541,7 @@ def test_models_on_the_command_line_are_for_all_or_for_a_topic(tmp_path: Path, m
     assert assigned(["lr=0.1/m.safetensors"]) == {"": "lr=0.1/m.safetensors"}
     for words, said in (
         (["a", "b"], "a and b are both given for all IMUs"),
-        (["/imu0=a", "/imu0=b"], "a and b for /imu0"),
+        (["/imu0=a", "/imu0=b"], "a and b are both given for /imu0"),
         (["=a"], "expected MODEL or TOPIC=MODEL"),
         (["/imu0="], "expected MODEL or TOPIC=MODEL"),
     ):
