@@ -5,7 +5,8 @@ Candidates, from the simplest: `constant` (the prior of the rest bias alone), `l
 samples and `static`, the log's own rest bias without any training, are scored alike. The poses are first turned and shifted by
 the rotation and the clock that are fitted between them and the sensor for this log alone. Where they turn and the gyro does
 not, as over clipped samples, the path turns with them. The simplest candidate that is not
-beaten is kept, for the gyro by the orientation error (AOE), for the accelerometer by the velocity after 5 s from the truth.
+beaten is kept, for the gyro by the orientation error (AOE) and by the attitude after 5 s from the truth, for the accelerometer
+by the velocity after 5 s.
 Effects are linear in their parameters, so a left-out model is one Gauss-Newton step from the fit of all logs; the weights of
 outliers and the attitude under the accelerometer stay those of all logs (`tests/bench/left_out.py` fits anew).
 """
