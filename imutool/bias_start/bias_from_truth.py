@@ -95,7 +95,8 @@ def poses_turn_alone(imu: Imu, truth: Poses) -> Bool[np.ndarray, " n"]:
     """Samples over which the poses turn and the gyro does not.
 
     The gyro was clipped, samples are lost, or the poses jump: no bias mends that, and a path keeps the error to its end. Poses
-    often jump where some are missing, so turns over a short gap of the poses are compared, too.
+    often jump where some are missing, so turns over a short gap of the poses are compared, too. Poses that jump and are back in
+    the next step leave nothing to mend: half of such a jump would stay.
     """
     t, (poses, valid) = seconds(imu.t_ns, int(imu.t_ns[0])), truth.at(imu.t_ns)
     dt, out = np.diff(t), np.zeros(len(t), bool)
@@ -107,11 +108,13 @@ def poses_turn_alone(imu: Imu, truth: Poses) -> Bool[np.ndarray, " n"]:
         turned = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.gyro[:-1] * dt[:, None], axis=0)])
         seen, span, q = turned[end] - turned[begin], (t[end] - t[begin])[:, None], poses.q_wb_wxyz
         more = seen - quaternion.log(quaternion.multiply(quaternion.inverse(q[begin]), q[end]))
-        misfit = np.linalg.norm(more - np.median((more / span)[known], axis=0) * span, axis=1)
+        off = np.where(known[:, None], more - np.median((more / span)[known], axis=0) * span, 0.0)
+        beside = np.pad(off, ((1, 1), (0, 0)))
+        misfit, stays = (np.linalg.norm(x, axis=1) for x in (off, beside[:-2] + off + beside[2:]))
         most = np.maximum(JUMP_SHARE * np.linalg.norm(seen, axis=1), max(JUMP_RAD, JUMP_MEDIANS * median(misfit[known])))
         clipped = np.logical_or.reduce([at_limit(column) for column in imu.gyro.T])[:-1]
         lost = np.logical_or.reduceat(clipped | (dt > LOST * median(dt)), begin)
-        out[begin[0] : end[-1]] = np.repeat(known & (lost | (misfit > most)), end - begin)
+        out[begin[0] : end[-1]] = np.repeat(known & (lost | ((misfit > most) & (stays > most))), end - begin)
     return out
 
 
