@@ -132,7 +132,7 @@ def _evaluated(
     recording = replace(recording, truths={next(iter(recording.truths)): with_velocity(truth)})
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     recorded = [(RAW, recording.imu, None, None)]
-    recorded += [] if debiased is None else [(str(about.get("model", "debiased")), debiased.imu, None, None)]
+    recorded += [] if debiased is None else [(str(about.get("model") or "debiased"), debiased.imu, None, None)]
     found = started(recording, models, init, log, smooth=smooth, refused=refused)
     for name, imu, model, start in [*recorded, *((name, recording.imu, model, start) for name, model, start in found)]:
         rows, true, valid = stretch_with_truth(imu.t_ns, recording.truth, recording.name)
