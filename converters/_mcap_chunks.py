@@ -15,7 +15,7 @@ _Waiting = tuple[int, int, int, int, int, bytes]  # log time, place of its chunk
 
 
 def in_order(reader: Any, file: BinaryIO) -> Iterator[tuple[Any, Any, Message]]:
-    """What `reader.iter_messages()` yields.
+    """Schema, channel and content of each message, as `reader.iter_messages()` yields them.
 
     Chunks are sorted as they come, in place of a heap of single messages.
     """
@@ -39,7 +39,11 @@ def in_order(reader: Any, file: BinaryIO) -> Iterator[tuple[Any, Any, Message]]:
 
 
 def _messages_in(chunk: Any, at: int) -> Iterator[_Waiting]:
-    """Messages of a chunk; the library's own records take three times as long."""
+    """Messages of a chunk; the library's own records take three times as long.
+
+    Raises:
+        ValueError: a record that is longer than its chunk, or shorter than the head of a message.
+    """
     from mcap.stream_reader import get_chunk_data_stream
 
     stream, size = get_chunk_data_stream(chunk, validate_crc=True)
@@ -47,6 +51,8 @@ def _messages_in(chunk: Any, at: int) -> Iterator[_Waiting]:
     while place < size:
         opcode, length = RECORD.unpack_from(data, place)
         place += RECORD_HEAD
+        if length > size - place or (opcode == MESSAGE_OPCODE and length < MESSAGE.size):
+            raise ValueError(f"a record of {length} bytes in a chunk of {size}")
         if opcode == MESSAGE_OPCODE:
             channel, _, log_time, publish_time = MESSAGE.unpack_from(data, place)
             yield log_time, at, number, channel, publish_time, data[place + MESSAGE.size : place + length]
@@ -55,7 +61,7 @@ def _messages_in(chunk: Any, at: int) -> Iterator[_Waiting]:
 
 
 def _defined(summary: Any, waiting: _Waiting) -> tuple[Any, Any, Message]:
-    log_time, _, _, number, publish_time, payload = waiting
-    channel = summary.channels[number]
+    log_time, _, _, channel_id, publish_time, payload = waiting
+    channel = summary.channels[channel_id]
     schema = summary.schemas[channel.schema_id] if channel.schema_id else None
     return schema, channel, Message(channel, log_time, publish_time, payload)

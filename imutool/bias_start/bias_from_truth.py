@@ -109,12 +109,12 @@ def poses_turn_alone(imu: Imu, truth: Poses) -> Bool[np.ndarray, " n"]:
         seen, span, q = turned[end] - turned[begin], (t[end] - t[begin])[:, None], poses.q_wb_wxyz
         more = seen - quaternion.log(quaternion.multiply(quaternion.inverse(q[begin]), q[end]))
         off = np.where(known[:, None], more - np.median((more / span)[known], axis=0) * span, 0.0)
-        beside = np.pad(off, ((1, 1), (0, 0)))
-        misfit, stays = (np.linalg.norm(x, axis=1) for x in (off, beside[:-2] + off + beside[2:]))
+        padded = np.pad(off, ((1, 1), (0, 0)))
+        misfit, lasting = (np.linalg.norm(x, axis=1) for x in (off, padded[:-2] + off + padded[2:]))
         most = np.maximum(JUMP_SHARE * np.linalg.norm(seen, axis=1), max(JUMP_RAD, JUMP_MEDIANS * median(misfit[known])))
         clipped = np.logical_or.reduce([at_limit(column) for column in imu.gyro.T])[:-1]
         lost = np.logical_or.reduceat(clipped | (dt > LOST * median(dt)), begin)
-        out[begin[0] : end[-1]] = np.repeat(known & (lost | ((misfit > most) & (stays > most))), end - begin)
+        out[begin[0] : end[-1]] = np.repeat(known & (lost | ((misfit > most) & (lasting > most))), end - begin)
     return out
 
 

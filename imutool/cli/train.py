@@ -17,7 +17,7 @@ from imutool.cli.terminal import epoch_line, say, table
 from imutool.errors import ConfigError
 from imutool.report import UNSET, Report, Section, UnsetType
 
-AFTER = "after 5 s"  # drift of the attitude from the truth
+DRIFT_ROWS = "after 5 s"
 
 
 @app.command(
@@ -93,17 +93,21 @@ def left_out_table(left_out: Mapping[str, Any]) -> None:
         (score["log"], start, "raw"): score["aoe_deg"] for score in scores if score["model"] == "raw" for start in starts
     }
     drifts = [score for score in scores if score["start"] in ("", "truth") and score["drift_deg"] is not None]
-    errors |= {(score["log"], AFTER, score["model"]): score["drift_deg"] for score in drifts}
+    errors |= {(score["log"], DRIFT_ROWS, score["model"]): score["drift_deg"] for score in drifts}
     rows = [
         (log, error, [errors.get((log, error, model)) for model in models])
-        for error in (*starts, *([AFTER] if drifts else []))
+        for error in (*starts, *([DRIFT_ROWS] if drifts else []))
         for log in logs
     ]
     for error in dict.fromkeys(error for _, error, _ in rows):
         columns = zip(*(values for _, of, values in rows if of == error), strict=True)
         rows.append(("mean", error, [None if None in column else sum(column) / len(column) for column in columns]))
     cells = [
-        (log, error if error == AFTER else f"AOE, {error}", *("–" if value is None else f"{value:.2f}" for value in values))
+        (
+            log,
+            error if error == DRIFT_ROWS else f"AOE, {error}",
+            *("–" if value is None else f"{value:.2f}" for value in values),
+        )
         for log, error, values in rows
     ]
     table([("left-out log", "error °", *models), *cells], keys=2)

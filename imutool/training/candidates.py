@@ -20,7 +20,6 @@ from imutool.bias.networks.temperature import temperature_tensors
 from imutool.bias.temperature import Scale
 from imutool.training.bias_spread import speed_of, store_statistics, turn_on_prior
 from imutool.training.calibration.effect_selection import LINEAR, Calibration, effects_beyond_chance, parameter_columns
-from imutool.training.calibration.normal_equations import Solution
 from imutool.training.log_signals import effects_turned_alike
 from imutool.training.settings import TrainSettings
 from imutool.training.training_windows import Pool, without_motion
@@ -94,14 +93,14 @@ def left_out_model(
     return model
 
 
-def unknown_matrix(fit: Calibration, sensor: Sensor) -> Solution:
-    """Scale and misalignment of a constant bias: zero, and as uncertain as the logs show them.
+def left_out_covariance(fit: Calibration, sensor: Sensor) -> Float[torch.Tensor, "p p"]:
+    """Covariance about zero of the scale and misalignment that a constant bias leaves out.
 
-    The second moment about zero is that about the solution, and the square of the solution that the constant leaves out.
+    It is that about the solution, and the square of the solution.
     """
     columns = parameter_columns(fit.forms, LINEAR[sensor])
     theta, covariance = fit.problem.solve_by_scatter(columns)
-    return Solution(torch.zeros_like(theta[columns]), covariance + torch.outer(theta[columns], theta[columns]))
+    return covariance + torch.outer(theta[columns], theta[columns])
 
 
 def simpler_effects(fits: Mapping[Sensor, Calibration], kept: Mapping[Sensor, str]) -> dict[str, tuple[str, ...]]:

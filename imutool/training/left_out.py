@@ -68,21 +68,21 @@ class Score:
     drift_deg: float | None = None
 
 
-class Error(NamedTuple):
-    """Field and start of the scores that are compared; without a start their mean over all."""
+class Criterion(NamedTuple):
+    """Field of the scores that are compared, and a start; without one their mean counts."""
 
     field: str
     start: str = ""
 
 
-ERRORS: Mapping[Sensor, tuple[Error, ...]] = {
-    "gyro": (Error("aoe_deg"), *(Error("aoe_deg", start) for start in STARTS), Error("drift_deg", "truth")),
-    "accel": (Error("drift_m_s"), *(Error("drift_m_s", start) for start in STARTS)),
+CRITERIA: Mapping[Sensor, tuple[Criterion, ...]] = {
+    "gyro": (Criterion("aoe_deg"), *(Criterion("aoe_deg", start) for start in STARTS), Criterion("drift_deg", "truth")),
+    "accel": (Criterion("drift_m_s"), *(Criterion("drift_m_s", start) for start in STARTS)),
 }
 # Those by which a candidate replaces a simpler one. Errors of opposite signs cancel in the AOE of a log, in short windows less.
 DECISIVE = {
-    sensor: tuple(error for error in errors if not error.start or error.field == "drift_deg")
-    for sensor, errors in ERRORS.items()
+    sensor: tuple(criterion for criterion in criteria if not criterion.start or criterion.field == "drift_deg")
+    for sensor, criteria in CRITERIA.items()
 }
 
 
@@ -156,33 +156,37 @@ def keep(scores: Sequence[Score], sensor: Sensor) -> str:
     logs = list(dict.fromkeys(score.log for score in scores))
     present = [candidate for candidate in CANDIDATES if any(score.model == candidate for score in scores)]
     table = {
-        (model, error): _log_errors(scores, logs, model, error) for model in ("static", *present) for error in ERRORS[sensor]
+        (model, criterion): _log_errors(scores, logs, model, criterion)
+        for model in ("static", *present)
+        for criterion in CRITERIA[sensor]
     }
     sound = []
     for place, candidate in enumerate(present):
         simpler = [*(["static"] if sensor == "gyro" else []), *present[:place]]
-        if not any(beaten(table[candidate, error], table[other, error]) for other in simpler for error in ERRORS[sensor]):
+        if not any(
+            beaten(table[candidate, criterion], table[other, criterion]) for other in simpler for criterion in CRITERIA[sensor]
+        ):
             sound.append(candidate)
     return next(
         (
             candidate
             for place, candidate in enumerate(sound)
             if not any(
-                beaten(table[candidate, error], table[other, error], SURELY)
+                beaten(table[candidate, criterion], table[other, criterion], SURELY)
                 for other in sound[place + 1 :]
-                for error in DECISIVE[sensor]
+                for criterion in DECISIVE[sensor]
             )
         ),
         present[0],
     )
 
 
-def _log_errors(scores: Sequence[Score], logs: Sequence[str], model: str, error: Error) -> Float64[np.ndarray, " logs"]:
+def _log_errors(scores: Sequence[Score], logs: Sequence[str], model: str, criterion: Criterion) -> Float64[np.ndarray, " logs"]:
     """Logarithm of an error of each log, or its mean over all starts; NaN where there is none."""
     out = []
     for log in logs:
-        some = [score for score in scores if (score.model, score.log) == (model, log) and error.start in ("", score.start)]
-        known = [max(value, LEAST_ERROR) for score in some if (value := getattr(score, error.field)) is not None]
+        some = [score for score in scores if (score.model, score.log) == (model, log) and criterion.start in ("", score.start)]
+        known = [max(value, LEAST_ERROR) for score in some if (value := getattr(score, criterion.field)) is not None]
         out.append(float(np.mean(np.log(known))) if known else np.nan)
     return np.array(out)
 

@@ -73,7 +73,7 @@ def begin_at(network: BiasNetwork, sensor: Sensor, solution: Solution, trained: 
         network.take_covariance(each, covariance)
 
 
-def of_matrix(covariance: Float[Tensor, "9 9"]) -> Float[Tensor, "9 9"]:
+def matrix_covariance(covariance: Float[Tensor, "9 9"]) -> Float[Tensor, "9 9"]:
     """Covariance of a matrix, row by row, from that of misalignment and scale."""
     place = torch.tensor([*OFF_DIAGONAL, *DIAGONAL]).argsort()
     return covariance[place][:, place]

@@ -30,10 +30,10 @@ from imutool.recording import Recording
 from imutool.training import checkpoint
 from imutool.training.bias_spread import speed_of
 from imutool.training.calibration.effect_selection import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
-from imutool.training.candidates import simpler_effects, unknown_matrix
+from imutool.training.candidates import left_out_covariance, simpler_effects
 from imutool.training.fit import Epoch, Training, check_device, note
 from imutool.training.left_out import LEAST_ERROR, LEAST_GAIN, SURELY, beaten, compare
-from imutool.training.log_signals import of_matrix, with_poses_of_sensor
+from imutool.training.log_signals import matrix_covariance, with_poses_of_sensor
 from imutool.training.objectives.paper_scheme import PaperTraining
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.training.training_windows import Pool, check_trainable
@@ -183,7 +183,8 @@ def _physics_first(
         kept.store_statistics(without.pool)
     model = physics.finish(kept.model)
     for sensor in (sensor for sensor in constant if not fits[sensor].named):
-        model.take(sensor, LINEAR[sensor], *unknown_matrix(fits[sensor], sensor))
+        covariance = left_out_covariance(fits[sensor], sensor)
+        model.take(sensor, LINEAR[sensor], torch.zeros(len(covariance)), covariance)
     about = {"held_out": _held_out(kept), **_turn_on(kept)}
     return model, about | {"compared": held_out, "physics": _described(physics.fits)} | compared
 
@@ -254,7 +255,7 @@ def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: _
         compared, constant = {"left_out": comparison.card()}, comparison.constant
     training = descent(recordings, linear.Model.method, settings, constant)
     for sensor in constant:
-        training.model.take_covariance(sensor, of_matrix(unknown_matrix(physics.fits[sensor], sensor).covariance))
+        training.model.take_covariance(sensor, matrix_covariance(left_out_covariance(physics.fits[sensor], sensor)))
     return training.model, {"held_out": _held_out(training), **_turn_on(training)} | compared
 
 

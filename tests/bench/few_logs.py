@@ -49,8 +49,14 @@ def main() -> None:
             train(training, path, method=options.method, settings=settings)
             rows.append(scored(path, others))
             names = ", ".join(log.stem for log in training)
-            print(f"| {names} | {' | '.join(f'{value:.2f}' for value in rows[-1])} | {kept(path)} |", flush=True)
-    print(f"| mean | {' | '.join(f'{value:.2f}' for value in np.nanmean(rows, axis=0))} | |")
+            print(f"| {names} | {shown(rows[-1])} | {kept(path)} |", flush=True)
+    columns_of = ([value for value in column if np.isfinite(value)] for column in zip(*rows, strict=True))
+    print(f"| mean | {shown([float(np.mean(column)) if column else np.nan for column in columns_of])} | |")
+
+
+def shown(values: list[float]) -> str:
+    """Cells of a row."""
+    return " | ".join(f"{value:.2f}" if np.isfinite(value) else "–" for value in values)
 
 
 def scored(model: Path, logs: list[Path]) -> list[float]:

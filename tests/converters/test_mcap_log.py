@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import struct
 from base64 import b64decode
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imutool.converters import mcap_log
@@ -295,3 +296,22 @@ def test_chunks_that_overlap_come_in_the_order_of_their_log_times(tmp_path):
         assert len(reader.get_summary().chunk_indexes) > 10
         expected = [(channel.topic, message.data) for _, channel, message in reader.iter_messages()]
     assert [(message.topic.name, message.payload) for message in mcap_log._messages(path, images=True)] == expected
+
+
+@pytest.mark.parametrize("length", [5, 4000, 2**63])
+def test_a_record_that_does_not_fit_its_chunk_is_refused(convert, tmp_path, length):
+    """Without a CRC nothing else shows it."""
+    path = tmp_path / "in.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE, enable_crcs=False)
+        writer.start("", "test")
+        channel = writer.register_channel("/notes", "text", 0)
+        for n in range(3):
+            writer.add_message(channel, START_NS + n, b"hello", START_NS)
+        writer.finish()
+    content, head = path.read_bytes(), struct.pack("<BQ", 5, 22 + len(b"hello"))
+    path.write_bytes(content.replace(head, struct.pack("<BQ", 5, length)))
+    done = convert(path, tmp_path / "out.mcap")
+    assert done.returncode == 4, done.stderr
+    assert f"a record of {length} bytes in a chunk" in done.stderr
+    assert "imutool repair" in done.stderr

@@ -21,7 +21,7 @@ from imutool.diagnosis.estimation.trial.model_error import (
     below_model_error,
     below_reference_error,
     is_over_at_once,
-    is_rim,
+    is_part_of_misfit,
     with_low_pass_error,
 )
 from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection
@@ -101,8 +101,8 @@ def test_a_name_that_explains_little_of_a_far_larger_misfit_is_its_rim(name: str
     now = fit([planted.weighed(planted.pair(felt, added=added))], ())
     (effect,) = catalogue.diagnosed([name])
     left = now.objective - now.numbers
-    assert is_rim(effect, 0.02 * left, now) == rim
-    assert not is_rim(effect, 0.5 * left, now)
+    assert is_part_of_misfit(effect, 0.02 * left, now) == rim
+    assert not is_part_of_misfit(effect, 0.5 * left, now)
 
 
 @pytest.mark.parametrize(

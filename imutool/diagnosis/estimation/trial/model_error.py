@@ -88,12 +88,12 @@ def below_reference_error(effect: Effect, gain: float, found: Fit) -> bool:
     return gain < found.logs[0].pair.settings.search.model_error_reference * motion
 
 
-def is_rim(effect: Effect, gain: float, found: Fit) -> bool:
-    """Whether an effect is the rim of a far larger misfit, of slow motion on its sensors.
+def is_part_of_misfit(effect: Effect, gain: float, found: Fit) -> bool:
+    """Whether an effect explains a small part of a misfit of slow motion that has no name.
 
     Whatever moves with the body explains some of such a misfit, so a name for it would be wrong.
     """
-    least = found.logs[0].pair.settings.search.rim_leaves * gain
+    least = found.logs[0].pair.settings.search.larger_misfit * gain
     return _follows_body(effect, found) and all(leaves_slow_motion(found, sensor, least) for sensor in effect.sensors)
 
 
@@ -104,7 +104,7 @@ def _follows_body(effect: Effect, found: Fit) -> bool:
 
 
 def is_over_at_once(effect: Effect, theta: Theta, factor: float) -> bool:
-    """Whether a drift is far larger than plausible, over before the first sample.
+    """Whether a drift is implausibly large and over before the first sample.
 
     Any size of it fits what the first samples show of its tail.
     """

@@ -28,7 +28,7 @@ from imutool.diagnosis.estimation.trial.model_error import (
     below_model_error,
     below_reference_error,
     is_over_at_once,
-    is_rim,
+    is_part_of_misfit,
     of_motion,
     with_low_pass_error,
 )
@@ -157,7 +157,7 @@ class Trial:
             below = frozenset(key for key in hidden(every) if not self._shown_elsewhere(key, every, whole))
         below |= {one.effect.key for one in verdicts if self._may_be_error(one.effect, whole)}
         below |= {one.effect.key for one in verdicts if below_reference_error(one.effect, one.gain, whole)}
-        below |= {one.effect.key for one in verdicts if exact and is_rim(one.effect, one.gain, whole)}
+        below |= {one.effect.key for one in verdicts if exact and is_part_of_misfit(one.effect, one.gain, whole)}
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in below else verdict for verdict in verdicts]
 
     def _shown_elsewhere(self, key: str, gains: Mapping[str, float], whole: Fit) -> bool:
