@@ -78,7 +78,7 @@ def checked(function: Function) -> Function:
         for name, value in bound.arguments.items():
             if name in kinds and not any(kind.accepts(value) for kind in kinds[name]):
                 expected = " or ".join(kind.words for kind in kinds[name])
-                raise ConfigError(f"of type {type(value).__name__}", where=name, expected=expected)
+                raise ConfigError(f"is of type {type(value).__name__}", where=name, expected=expected)
             if name in kinds and getattr(value, "shape", None) == ():  # a number or text of numpy's
                 bound.arguments[name] = value.item()
         return function(*bound.args, **bound.kwargs)
@@ -140,4 +140,4 @@ def init_text(init: Init) -> str:
         return init if isinstance(init, str) else ",".join(repr(float(number)) for number in init)
     except (TypeError, ValueError):
         kind = type(init).__name__
-        raise ConfigError(f"of type {kind}", where="init", expected="the name of a method, or six numbers") from None
+        raise ConfigError(f"is of type {kind}", where="init", expected="the name of a method, or six numbers") from None

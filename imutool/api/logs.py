@@ -97,7 +97,7 @@ def write(path: LogPath, recording: Recording, *, compression: str = "zstd", ove
     check_outputs([OutputFile("path", path, output_conflicts.LOG)], overwrite=overwrite)
     given: object = recording
     if not isinstance(given, Recording):
-        raise DataError(f"of type {type(given).__name__}", where="recording", expected="a Recording")
+        raise DataError(f"is of type {type(given).__name__}", where="recording", expected="a Recording")
     recording.imu.check_rate(recording.name)
     write_log(recording, location(path), compression=compression, overwrite=overwrite)
 

@@ -86,7 +86,7 @@ def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     """
     given: tuple[object, object] = (model, imu)
     if not isinstance(given[0], BiasModel) or not isinstance(given[1], Imu):
-        what = f"of type {type(given[0]).__name__}, {type(given[1]).__name__}"
+        what = f"are of type {type(given[0]).__name__}, {type(given[1]).__name__}"
         raise ConfigError(what, where="model, imu", expected="a model of `imutool.load_model`, and an `Imu`")
     imu.check_rate("imu")
     if wrong := unusual_gravity(imu.accel) if len(imu) else "":
@@ -240,7 +240,7 @@ def _refuse(options: Mapping[str, object]) -> None:
 def _debias_recording(recording: Recording, model: object, init: str, smooth: bool, force: bool) -> DebiasedRecording:
     if not isinstance(model, Model | None):
         raise ConfigError(
-            f"of type {type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model"
+            f"is of type {type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model"
         )
     recording.imu.check_rate(recording.name)
     about = recording.metadata.get("imutool", {})

@@ -202,7 +202,7 @@ def _loaded(runs: object) -> list[RunData]:
     """Runs of a notebook cell; ConfigError of others, such as a path."""
     given = several(runs)
     if wrong := [type(run).__name__ for run in given if not isinstance(run, RunData)]:
-        raise ConfigError(f"of type {wrong[0]}", where="runs", expected="runs of `imutool.load_run`")
+        raise ConfigError(f"is of type {wrong[0]}", where="runs", expected="runs of `imutool.load_run`")
     return given
 
 

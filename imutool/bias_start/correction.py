@@ -101,10 +101,10 @@ class OnlineDebiaser:
     def __init__(self, model: BiasModel, start: InitialBias | None = None, *, with_covariance: bool = False) -> None:
         given: tuple[object, object] = model, start
         if not isinstance(given[0], BiasModel):
-            what = f"of type {type(given[0]).__name__}"
+            what = f"is of type {type(given[0]).__name__}"
             raise ConfigError(what, where="model", expected="a loaded model", fix="Load it with `imutool.load_model`")
         if not isinstance(given[1], InitialBias | None):
-            what = f"of type {type(given[1]).__name__}"
+            what = f"is of type {type(given[1]).__name__}"
             raise ConfigError(what, where="start", expected="a bias of `imutool.bias_at_rest`, or None")
         self._model, self._start, self._begun = model, start, False
         self._start_ns, self._before_ns, self._bias = 0, 0, np.zeros(6)

@@ -57,6 +57,7 @@ MOST_NOISE = 4.0  # ratio to the residuals of the training logs; training logs u
 MOST_RATE = 2e-3  # relative difference of sample rates; one unit's clock stays within 1e-4
 HALF, MOST_SHARE = 0.5, 1.5  # of a correction: between them it does more good than harm
 LEAST_SHARE = -2.0  # below, the log lacks so much else that the correction makes it worse by less than half
+LEAST_SHOWN = 0.005  # deviation of a share that a percentage shows
 SURE = 3.0  # standard deviations; of made-up sensors' own shares, the largest lies 3.8 from one
 
 
@@ -244,7 +245,8 @@ def _refuted(share: Share) -> Iterator[str]:
 
 def _shown_share(share: Share) -> str:
     """Share of the correction that the log shows, in words."""
-    return f"gravity and stops show {share.value:.0%} ± {share.std:.0%} of the model's correction in motion"
+    deviation = f" ± {share.std:.0%}" if share.std >= LEAST_SHOWN else ""
+    return f"gravity and stops show {share.value:.0%}{deviation} of the model's correction in motion"
 
 
 def _worse_than_none(samples: Samples, used: BiasPrior, found: _Evidence, prior: BiasPrior, none: _Evidence) -> list[str]:

@@ -6,7 +6,8 @@ samples and `static`, the log's own rest bias without any training, are scored a
 the rotation and the clock that are fitted between them and the sensor for this log alone. Where they turn and the gyro does
 not, as over clipped samples, the path turns with them. The simplest candidate that is not
 beaten is kept, for the gyro by the orientation error (AOE) and by the attitude after 5 s from the truth, for the accelerometer
-by the velocity after 5 s.
+by the velocity after 5 s. One or two logs are cut in parts, which are often no longer than a start from the truth. Their scores
+decide nothing: the candidate is kept that predicts the windows of each part best.
 Effects are linear in their parameters, so a left-out model is one Gauss-Newton step from the fit of all logs; the weights of
 outliers and the attitude under the accelerometer stay those of all logs (`tests/bench/left_out.py` fits anew).
 """
@@ -36,7 +37,7 @@ from imutool.inertial.strapdown import along_truth, drift
 from imutool.processes.forked import of_each
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
 from imutool.training.calibration.effect_selection import LINEAR, Calibration, parameter_columns
-from imutool.training.candidates import CANDIDATES, known, left_out_effects, left_out_model, with_statistics
+from imutool.training.candidates import CANDIDATES, best_predicted, known, left_out_effects, left_out_model, with_statistics
 from imutool.training.log_agreement import Contradiction, check_axes, contradicting
 from imutool.training.log_signals import without_nuisances
 from imutool.training.settings import TrainSettings
@@ -88,10 +89,11 @@ DECISIVE = {
 
 @dataclass(frozen=True)
 class Comparison:
-    """Scores of left-out logs, the candidates kept, and the logs that contradict the others."""
+    """Scores of left-out logs or `parts`, candidates kept, and logs that contradict the others."""
 
     scores: tuple[Score, ...]
     kept: Mapping[Sensor, str]
+    parts: bool
     contradicting: tuple[Contradiction, ...] = ()
 
     @property
@@ -102,7 +104,7 @@ class Comparison:
     def card(self) -> dict[str, Any]:
         """Entry of a model card."""
         scores, contradicting = ([vars(entry) for entry in entries] for entries in (self.scores, self.contradicting))
-        return {"kept": dict(self.kept), "scores": scores, "contradicting": contradicting}
+        return {"kept": dict(self.kept), "parts": self.parts, "scores": scores, "contradicting": contradicting}
 
 
 def compare(
@@ -145,7 +147,9 @@ def compare(
     contradictions = contradicting(pool, fits)
     for contradiction in contradictions:
         logger.warning("%s", contradiction)
-    return Comparison(tuple(scores), {sensor: keep(scores, sensor) for sensor in fits}, contradictions)
+    parts = len(logs) > len(recordings)
+    kept = {sensor: best_predicted(fit, sensor, candidates) if parts else keep(scores, sensor) for sensor, fit in fits.items()}
+    return Comparison(tuple(scores), kept, parts, contradictions)
 
 
 def keep(scores: Sequence[Score], sensor: Sensor) -> str:

@@ -184,7 +184,7 @@ def placed(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """
     given: object = settings
     if not isinstance(given, Mapping):
-        raise ConfigError(f"of type {type(given).__name__}", where="settings", expected="a dictionary")
+        raise ConfigError(f"is of type {type(given).__name__}", where="settings", expected="a dictionary")
     general = {key: value for key, value in settings.items() if full_name(method, key) == key}
     own = {key: value for key, value in settings.items() if key not in general}
     return {**general, "model": {**general.get("model", {}), **own}} if own else general

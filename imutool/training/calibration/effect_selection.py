@@ -32,7 +32,7 @@ from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import Load, Signals
 from imutool.training.calibration.log_scatter import widest
-from imutool.training.calibration.normal_equations import Problem, Seen, linearise
+from imutool.training.calibration.normal_equations import Problem, Seen, gain_of, linearise
 from imutool.training.fit import Epoch, note
 from imutool.training.log_signals import effects_turned_alike, loaded_signals, signals_of
 from imutool.training.settings import SensorPrior, TrainSettings
@@ -42,7 +42,6 @@ from imutool.units import SENSORS, Sensor
 BY_CHANCE = 0.01  # probability of finding any effect where there is none
 LEAST_GAIN = 0.03  # of the judged loss, for an effect to be worth its parameters
 DRIFTS = dict.fromkeys(("gyro_warm_up", "gyro_rate_load", "gyro_force_load", *temperature.EFFECTS), 0.3)  # they look alike
-TINY = 1e-12  # of a loss, whose unit is a window's noise
 LINEAR: Mapping[Sensor, tuple[str, ...]] = {sensor: (f"{sensor}_misalignment", f"{sensor}_scale") for sensor in SENSORS}
 CONTAINED = {"rate_curve": "gyro_scale"}  # a curve imitates a scale, which then needs evidence as any other effect
 FOLDS = 3  # parts of a log where there are fewer logs than this
@@ -154,23 +153,18 @@ def effects_beyond_chance(problem: Problem, effects: Sequence[LinearForm]) -> di
     while True:
         left = [effect.name for effect in effects if effect.name not in gains]
         tried = {name: problem.predicted(parameter_columns(effects, [*gains, name])) for name in left}
-        enough = {name: new for name, new in tried.items() if _gain(new, loss) >= DRIFTS.get(name, LEAST_GAIN)}
+        enough = {name: new for name, new in tried.items() if gain_of(new, loss) >= DRIFTS.get(name, LEAST_GAIN)}
         helped = {name: new for name, new in enough.items() if bool((new < loss).sum() > 0.5 * len(loss))}
         agreed = {name: new for name, new in helped.items() if _beyond_chance(problem, effects, [*gains, name])}
-        best = max(agreed, key=lambda name: _gain(agreed[name], loss), default="")
+        best = max(agreed, key=lambda name: gain_of(agreed[name], loss), default="")
         if not best:
             break
-        gains[best], loss = _gain(agreed[best], loss), agreed[best]
+        gains[best], loss = gain_of(agreed[best], loss), agreed[best]
     imitated = {CONTAINED[name] for name in gains if name in CONTAINED}
     for name in (form.name for form in effects if form.name in LINEAR[form.sensor] and form.name not in {*gains, *imitated}):
         new = problem.predicted(parameter_columns(effects, [*gains, name]))
-        gains[name], loss = _gain(new, loss), new
+        gains[name], loss = gain_of(new, loss), new
     return gains
-
-
-def _gain(new: Float[Tensor, " logs"], loss: Float[Tensor, " logs"]) -> float:
-    """Share of the loss taken off, by the geometric mean over logs: a log that nothing explains does not outvote the others."""
-    return 1 - float((new.clamp_min(TINY) / loss.clamp_min(TINY)).log().mean().exp())
 
 
 def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Sequence[str]) -> bool:

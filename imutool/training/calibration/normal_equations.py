@@ -39,6 +39,7 @@ REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of m
 SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
 SETTLED, MOST_STEPS = 0.2, 40  # deviations by which a step moves a parameter at most; steps with windows of all lengths
 WEAK = 0.01  # of a prior's precision, that of the prior at first
+TINY = 1e-12  # of a loss, whose unit is a window's noise
 RIDGE = 1e-9  # of a diagonal, so that a log without information on its own unknowns can be solved
 
 
@@ -145,6 +146,14 @@ class Problem:
     def _own_equations(self, fit: Equations) -> tuple[Float[Tensor, "logs o o"], Float[Tensor, "logs o"]]:
         p = len(self.prior)
         return fit.H[:, p:, p:] + torch.diag(self.own_prior), fit.g[:, p:] + self.own_prior * self.own
+
+
+def gain_of(new: Float[Tensor, " logs"], loss: Float[Tensor, " logs"]) -> float:
+    """Share of the losses of logs that new ones take off, by a geometric mean.
+
+    A log that nothing explains does not outvote the others.
+    """
+    return 1 - float((new.clamp_min(TINY) / loss.clamp_min(TINY)).log().mean().exp())
 
 
 def design_effect(pool: Pool) -> float:

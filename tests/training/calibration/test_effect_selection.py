@@ -17,6 +17,7 @@ from imutool.sensor.linear_form import LinearForm, compiled
 from imutool.sensor.signals import SignalFilter
 from imutool.training.calibration.effect_selection import FOLDS, LINEAR, Calibration, calibrate, folded
 from imutool.training.calibration.normal_equations import design_effect
+from imutool.training.candidates import CANDIDATES, best_predicted
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Pool
 from imutool.units import Sensor
@@ -160,6 +161,23 @@ def test_a_curve_that_no_name_describes_is_found_as_a_curve(flights: list[Record
     calibration = calibrate(pool, "gyro", pool.gyro)
     assert "rate_curve" in calibration.effects
     assert next(iter(calibration.gains)) == "rate_curve"
+
+
+def test_parts_of_one_log_are_predicted_best_by_what_was_planted(flights: list[Recording]) -> None:
+    """The table of left-out parts cannot tell: a start from the truth is as long as a part."""
+    linear = catalogue.trained("gyro", LINEAR["gyro"])
+    (curve,) = catalogue.trained("gyro", ["rate_curve"])
+    step = np.array([0.02 * np.sign(float(parameter.name.removeprefix("slow_")[1:])) for parameter in curve.parameters])
+    step[["slow" in parameter.name for parameter in curve.parameters]] = 0.0
+    none: tuple[LinearForm, ...] = ()
+    for effects, theta, expected in (
+        (none, np.zeros(0), ("constant",)),
+        (linear, planted_theta(linear), ("linear", "effects")),  # the effects contain both
+        ((curve,), step, ("effects",)),
+    ):
+        pool = Pool.of([measured(flights[0], effects, theta, 0)])
+        fit = calibrate(pool, "gyro", pool.gyro)
+        assert best_predicted(fit, "gyro", CANDIDATES) in expected, fit.gains
 
 
 def test_a_rest_bias_of_its_own_is_found_for_every_log(without_effects: Callable[[int, Sensor], Calibration]) -> None:
