@@ -125,6 +125,8 @@ def lines_of_choice(card: Mapping[str, Any]) -> list[str]:
         before = {sensor: found["error"] for sensor, found in compared["effects"].items()}
         errors = (f"{sensor} {before[sensor]:.3g} to {found['error']:.3g} {found['unit']}" for sensor, found in ode.items())
         lines.append(f"neural ODE {kept}: held-out error of {', of '.join(errors)}")
+    elif compared and len(card["logs"]) == 1:
+        lines.append("no neural ODE: one log shows only what fits its own motion")
     return lines
 
 

@@ -172,7 +172,7 @@ def _physics_first(
             without = descent(physics.recordings, static.Model.method, alone, statistics=False)
     held_out: dict[str, Any] = {"effects": _held_out(without)}
     kept = without
-    if physics.model.config.remainder:
+    if physics.model.config.remainder and len(recordings) > 1:  # a single log shows what fits its own motion
         shared = with_poses_of_sensor(physics.recordings, [fit.own for fit in physics.fits.values()])
         before = descent(shared, static.Model.method, alone, statistics=False)
         of_ode = physics.ode_settings(settings)
@@ -220,9 +220,8 @@ def _drift_first(
 
 def helps(before: LogErrors, after: LogErrors) -> bool:
     """Whether a descent lowers a sensor's errors beyond the scatter of logs, and harms none."""
-    scattered = all(len(errors) > 1 for errors in before.values())  # a single log shows what fits its own motion
     harm = max(float(np.mean(after[sensor] - before[sensor])) for sensor in before)
-    return scattered and harm < LEAST_GAIN and any(beaten(before[sensor], after[sensor], SURELY) for sensor in before)
+    return harm < LEAST_GAIN and any(beaten(before[sensor], after[sensor], SURELY) for sensor in before)
 
 
 def _log_errors(training: Training) -> LogErrors:
