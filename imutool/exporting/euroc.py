@@ -146,13 +146,15 @@ class _Asl:
     def _poses(self, number: int, topic: str, poses: Poses, scalars: Mapping[str, Scalars]) -> None:
         """Writes true poses under EuRoC's names, the first as the ground truth."""
         folder = TRUTH_FOLDER if number == 0 else TRUTH_FOLDERS.get(topic)
-        biases = [self._bias(topic, poses, end, scalars) for end in SENSORS]
-        if folder is None or not len(poses):
+        if folder is None:
             return
         taken = next((other for other, (_, name, _) in self._tables.items() if name == folder), topic)
         if taken != topic:
-            if self._tables[taken][0] > number:
+            if len(poses) and self._tables[taken][0] > number:
                 raise NotInPartsError
+            return
+        biases = [self._bias(topic, poses, end, scalars) for end in SENSORS]
+        if not len(poses):
             return
         if topic not in self._tables:
             self.used.add(topic)
