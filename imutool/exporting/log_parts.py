@@ -20,7 +20,7 @@ class NotInPartsError(Exception):
 
 
 def read_in_parts(log: Log, imu: str) -> Iterator[Recording]:
-    """The recording in a log in parts of `PART_ROWS` samples by log time, the first with all images.
+    """Parts of a log's recording by log time, of `PART_ROWS` samples; the first has all images.
 
     Raises:
         NotInPartsError: stamps do not increase, or there is something to warn of; `read_recordings` of the whole says what.

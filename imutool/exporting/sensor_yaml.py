@@ -24,7 +24,7 @@ IDENTITY = "  cols: 4\n  rows: 4\n  data: [1.0, 0.0, 0.0, 0.0,\n" + (
 
 
 def imu_yaml(recording: Recording, kept: str, rate_hz: float, given: Noise | None) -> str:
-    """The source's own sensor.yaml, `kept`, unless another noise is given, else a data sheet's figures."""
+    """The source's sensor.yaml, `kept`, unless noise is given; else a data sheet's figures."""
     note = f"{SIGNATURE} from {_line(recording.name)}, topic {_line(recording.imu_topic)}\n"
     if kept and given is None:
         directive, rest = (kept + "\n").split("\n", 1) if kept.startswith("%") else ("", kept)  # %YAML must come first

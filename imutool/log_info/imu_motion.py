@@ -1,4 +1,4 @@
-"""Motion of an IMU from samples in blocks: what the rules about units, axes and frames ask of it."""
+"""Motion of an IMU in blocks, for the rules about units, axes and frames."""
 
 from __future__ import annotations
 
