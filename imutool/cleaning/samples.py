@@ -27,7 +27,7 @@ class Samples(NamedTuple):
     stamp_ns: Int64[np.ndarray, " n"]
     values: Float64[np.ndarray, "n 6"]  # gyro, accel, in the log's own units
 
-    def where(self, index: slice | Bool[np.ndarray, " n"]) -> Samples:
+    def where(self, index: slice | Bool[np.ndarray, " n"] | Int64[np.ndarray, " n"]) -> Samples:
         """Selected rows."""
         return Samples(*(column[index] for column in self))
 

@@ -259,14 +259,14 @@ def _rule(name: str) -> type[Rule]:
     return next(cls for cls in own if issubclass(cls, Rule))
 
 
-def raw_batches(log: Log, topic: str, end_ns: int | None = None) -> Iterator[ImuBatch]:
-    """Messages of an IMU as recorded, in file order, with unchecked values.
+def raw_batches(log: Log, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[ImuBatch]:
+    """Messages of an IMU as recorded, in file order, with unchecked values; log times select.
 
     Raises:
         LogError: no such IMU topic, another encoding, or damage.
     """
     described = log.topic(topic, (schemas.IMU,))
-    for rows in messages.joined(rows for _, rows in log.rows([described.name], end_ns=end_ns)):
+    for rows in messages.joined(rows for _, rows in log.rows([described.name], start_ns, end_ns)):
         with log.named(described.name):
             yield from described.decode_imu(rows)
 

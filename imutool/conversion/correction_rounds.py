@@ -21,7 +21,7 @@ from imutool.conversion.common_setup import combined, fitted_to
 from imutool.conversion.corrections import CONVENTIONS, NOT_TURNED, STAMPS, Corrections, pose_notes
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.restamping import find_stamps
-from imutool.log_info.inspection import sound_samples
+from imutool.log_info.imu_samples import ImuSamples
 from imutool.log_info.pose_imu_rotation import Body, body_of, frames_of_copies, is_straight, turned_body
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.reflection import Reflected
@@ -77,7 +77,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             comes_later = topic in imus or survey.pose_delay_ns or survey.quaternions  # all of it hides a body's rotation
             turned: Body | None = None if mount is None else body_of(log, survey.pose_topic, mount.T)
             if mount is None and not comes_later:
-                turned = turned_body(log, sound_samples(log, topic), survey.pose_topic)
+                turned = turned_body(log, ImuSamples(log, topic), survey.pose_topic)
             if changes := pose_notes(survey.world, survey.quaternions, survey.position_unit, survey.pose_delay_ns, turned):
                 world, late_ns, body, pose_topic = survey.world, survey.pose_delay_ns, turned or NOT_TURNED, survey.pose_topic
                 unit, quaternions, copies = survey.position_unit, survey.quaternions, frames_of_copies(log, pose_topic)
@@ -91,7 +91,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
 
 def _one_is_straight(log: Log, imus: Sequence[str], pose_topic: str) -> bool:
     """Whether an IMU lies as the body of the poses does."""
-    return any(is_straight(log, sound_samples(log, topic), pose_topic) for topic in imus)
+    return any(is_straight(log, ImuSamples(log, topic), pose_topic) for topic in imus)
 
 
 def _imu_note(survey: Survey) -> str:

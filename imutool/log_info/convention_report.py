@@ -7,8 +7,6 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from imutool.array_types import Int64
-from imutool.cleaning import CleaningSettings
 from imutool.cleaning.conventions import Conventions
 from imutool.cleaning.likelihood import Reading
 from imutool.cleaning.pose_delay import lateness
@@ -17,15 +15,14 @@ from imutool.cleaning.rules.axes import LATE_STDS, Axes
 from imutool.cleaning.rules.saturation import Saturation
 from imutool.cleaning.rules.stuck import Stuck
 from imutool.cleaning.rules.units import Units
-from imutool.cleaning.samples import BLOCK, Motion, Samples
-from imutool.cleaning.stamp_line import distinct
 from imutool.cleaning.truth import Truth, truth_of
 from imutool.cleaning.unit_evidence import accel_reading
-from imutool.errors import DataError, LogError
-from imutool.log_info.pose_imu_rotation import CORRECTION, agreement, body_warnings, motion_warnings, unlike, velocities_judged
+from imutool.errors import DataError
+from imutool.log_info.imu_motion import ImuMotion, blocks_of, motion_of
+from imutool.log_info.pose_imu_rotation import CORRECTION, body_warnings, motion_warnings, unlike, velocities_judged
 from imutool.log_info.report import Convention, TruthInfo
 from imutool.mcap_io.log import Log
-from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds
+from imutool.recording import Imu, Recording
 
 logger = logging.getLogger(__name__)
 
@@ -50,26 +47,16 @@ NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or
 
 def convention_summary(imu: Imu, truth: Truth | None) -> TopicSummary:
     """Totals for the rules about conventions; nothing is converted."""
-    motion = Motion()
-    for samples in _blocks(imu):
-        motion.see(samples)
-    return TopicSummary(CleaningSettings(convert_units=False), len(imu), motion, truth)
-
-
-def _blocks(imu: Imu) -> Iterator[Samples]:
-    for first in range(0, len(imu), BLOCK):
-        s = slice(first, first + BLOCK)
-        t_ns, values = imu.t_ns[s], np.concatenate([imu.gyro[s], imu.accel[s]], axis=1)
-        yield Samples(first + np.arange(len(t_ns)), t_ns, t_ns, values)
+    return motion_of(imu).summary(truth)
 
 
 def defect_warnings(imu: Imu, whole: TopicSummary) -> list[str]:
     """Warning of axes that stand still or are clipped, of an IMU whose sensors both change."""
     stuck, saturation = Stuck(), Saturation()
-    for _ in saturation(stuck(_blocks(imu))):
+    for _ in saturation(stuck(blocks_of(imu))):
         pass
     found = [f"{finding.count} {finding.what}" for rule in (stuck, saturation) for finding in rule.findings(whole)]
-    return ["; ".join(found)] if found and not constant_sensors(imu) else []
+    return ["; ".join(found)] if found and not motion_of(imu).constant_sensors() else []
 
 
 def convention_warnings(whole: TopicSummary) -> list[str]:
@@ -88,22 +75,16 @@ def contradictions(whole: TopicSummary) -> list[str]:
     return [finding.what for finding in Axes().findings(whole) if finding.severity == "error"]
 
 
-def constant_sensors(imu: Imu) -> list[str]:
-    """Warnings of a gyro or an accelerometer that never changes: a measurement has noise."""
-    why = "no sensor is behind it, or a simulation at rest without noise"
-    read = {"gyro": imu.gyro, "accel": imu.accel} if len(imu) > 1 else {}
-    constant = {name: values[0] + 0.0 for name, values in read.items() if not np.ptp(values, axis=0).any()}  # no -0.0
-    return [f"{name} reads {value.tolist()} in {len(imu)} samples in a row: {why}" for name, value in constant.items()]
-
-
-def _warnings(imu: Imu, whole: TopicSummary) -> list[str]:
+def _warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
     """Warnings about units, axes and frames of samples that are used uncorrected."""
-    warnings = [*constant_sensors(imu), *convention_warnings(whole)] if len(imu) else []
-    found = agreement(whole.truth, imu) if whole.truth is not None and not warnings else None
-    if whole.truth is None or found is None:
+    if not found.motion.samples:
+        return []
+    warnings = [*found.constant_sensors(), *convention_warnings(whole)]
+    turns = None if whole.truth is None or warnings else found.turns[whole.truth.topic].agreement()
+    if whole.truth is None or turns is None:
         return warnings
-    topic, turned_deg = whole.truth.topic, [] if found.turned is None else found.turned.deg.tolist()
-    seen = found.explained, found.rms_rad_s, found.jumps, found.largest_jump_deg
+    topic, turned_deg = whole.truth.topic, [] if turns.turned is None else turns.turned.deg.tolist()
+    seen = turns.explained, turns.rms_rad_s, turns.jumps, turns.largest_jump_deg
     return [*body_warnings(topic, turned_deg), *motion_warnings(topic, *seen)]
 
 
@@ -116,9 +97,9 @@ def check_start_poses(recording: Recording) -> float:
         DataError: such poses.
     """
     truth = truth_of(recording)
-    found = None if truth is None else agreement(truth, recording.imu)
-    whole = convention_summary(recording.imu, truth)
-    for warning in _warnings(recording.imu, whole):
+    motion = motion_of(recording.imu, truth)
+    found, whole = None if truth is None else motion.turns[truth.topic].agreement(), motion.summary(truth)
+    for warning in _warnings(motion, whole):
         if warning.endswith(CORRECTION) or (found is not None and unlike(found.explained, found.rms_rad_s)):
             raise DataError(
                 warning.removesuffix(f"; {CORRECTION}"),
@@ -137,19 +118,22 @@ def check_poses(recording: Recording, *, world: bool = True) -> None:
     Raises:
         DataError: such poses; their body and their clock may differ from the IMU's.
     """
-    whole = convention_summary(recording.imu, truth_of(recording))
+    truth = truth_of(recording)
+    motion = motion_of(recording.imu, truth)
+    whole = motion.summary(truth)
     for finding in Axes().findings(whole):
         if "poses" in finding.values and (world or whole.quaternions or whole.position_unit != "m"):
             expected = "quaternions as w, x, y, z from body to world, z up, and metres"
             raise DataError(finding.what, where=recording.name, expected=expected, fix=CORRECTION)
-    for warning in _warnings(recording.imu, whole):
+    for warning in _warnings(motion, whole):
         logger.warning("%s: %s", recording.name, warning)
 
 
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> TopicSummary:
     """Warn of units, axes, frames, and dead or clipped axes of uncorrected samples."""
-    whole = convention_summary(imu, truth)
-    for warning in [*_warnings(imu, whole), *defect_warnings(imu, whole)]:
+    motion = motion_of(imu, truth)
+    whole = motion.summary(truth)
+    for warning in [*_warnings(motion, whole), *defect_warnings(imu, whole)]:
         logger.warning("%s: %s", where, warning)
     return whole
 
@@ -181,12 +165,22 @@ def check_conventions(recordings: Iterable[Recording]) -> None:
         DataError: what `convert --fix` corrects.
     """
     for recording in map(velocities_judged, recordings):
-        for warning in _warnings(recording.imu, convention_summary(recording.imu, truth_of(recording))):
-            where = f"{recording.name} {recording.imu_topic}"
-            if warning.endswith(CORRECTION):
-                what = warning.removesuffix(f"; {CORRECTION}")
-                raise DataError(what, where=where, expected="units, axes and poses that agree", fix=CORRECTION)
-            logger.warning("%s: %s", where, warning)
+        truth = truth_of(recording)
+        check_motion(motion_of(recording.imu, truth), truth, f"{recording.name} {recording.imu_topic}")
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def check_motion(motion: ImuMotion, truth: Truth | None, where: str) -> None:
+    """The same of samples and poses that came in blocks.
+
+    Raises:
+        DataError: what `convert --fix` corrects.
+    """
+    for warning in _warnings(motion, motion.summary(truth)):
+        if warning.endswith(CORRECTION):
+            what = warning.removesuffix(f"; {CORRECTION}")
+            raise DataError(what, where=where, expected="units, axes and poses that agree", fix=CORRECTION)
+        logger.warning("%s: %s", where, warning)
 
 
 def check_units(whole: TopicSummary, where: str) -> None:
@@ -240,42 +234,6 @@ def _ratio(reading: Reading) -> str:
 
 def _unknown(whole: TopicSummary, why: str) -> tuple[bool, str]:
     return False, f"cannot be judged: {NO_POSES if whole.truth is None else why}"
-
-
-def transforms(log: Log, topic: str) -> list[tuple[str, Int64[np.ndarray, "..."]]]:
-    """Children of frames without a parent, as TOPIC/CHILD_FRAME, with their stamps."""
-    found: dict[tuple[str, str], list[Int64[np.ndarray, "..."]]] = {}
-    try:
-        for batch in log.pose_batches(topic):
-            found.setdefault((batch.frame_id.lstrip("/"), batch.child_frame_id.lstrip("/")), []).append(batch.stamp_ns)
-    except LogError as error:
-        logger.warning("%s %s: %s", log.path, topic, error.what)
-    children = {child for _, child in found}
-    return [(f"{topic}/{child}", np.concatenate(stamps)) for (parent, child), stamps in found.items() if parent not in children]
-
-
-def coverage(topic: str, kind: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:
-    """Truth coverage: share of the IMU's time between neighbouring true poses."""
-    knots = distinct(truth_ns)
-    if len(knots) < 2 or not len(imu_ns):
-        return TruthInfo(topic, len(truth_ns), kind)
-    start, end = int(imu_ns.min()), int(imu_ns.max())
-    steps = np.diff(knots)
-    limit = max(GAP_FACTOR * float(np.median(steps)), nanoseconds(MIN_GAP_S))  # 4 median periods, 60 ms
-    gap = (steps > limit) & (knots[1:] > start) & (knots[:-1] < end)
-    after = np.searchsorted(knots, imu_ns, side="left")
-    inside = (imu_ns >= knots[0]) & (imu_ns <= knots[-1])
-    known = (steps <= limit)[np.clip(after - 1, 0, len(steps) - 1)] | (knots[np.clip(after, 0, len(steps))] == imu_ns)
-    return TruthInfo(
-        topic,
-        len(truth_ns),
-        kind,
-        coverage=float((inside & known).mean()),
-        gaps=int(gap.sum()),
-        longest_gap_s=float(steps[gap].max()) * 1e-9 if gap.any() else 0.0,
-        starts_after_s=float(knots[0] - start) * 1e-9,
-        ends_before_s=float(end - knots[-1]) * 1e-9,
-    )
 
 
 def made_by_convert(log: Log, *, has_imu: bool, has_poses: bool) -> list[str]:

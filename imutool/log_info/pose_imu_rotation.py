@@ -8,10 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64, Int64
+from imutool.array_types import Float64, Int64
+from imutool.cleaning.samples import BLOCK
 from imutool.cleaning.truth import Truth, Turned, best_rotation, read_truth, rotation_deg, turning
 from imutool.geometry import quaternion
 from imutool.inertial.strapdown import velocity_follows
+from imutool.log_info.imu_samples import ImuSamples
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.recording import GAP_FACTOR, Imu, Recording, seconds
@@ -47,29 +49,80 @@ class Agreement(NamedTuple):
         return own | {"jumps": self.jumps, "largest_jump_deg": self.largest_jump_deg}
 
 
-def agreement(poses: Truth, imu: Imu) -> Agreement | None:
-    """Agreement of the turns of poses with the gyro; None where the two share too little motion.
+class GyroTurns:
+    """Turns of a gyro between poses, from samples in blocks."""
 
-    gyro = b + R omega, with the constant bias b and rotation R that fit best (Kabsch), over intervals of a tenth of a second
-    without a gap of the IMU. A few jumps of the poses are counted, and left out of all other figures.
-    """
-    if len(imu) < LEAST_TURNS or len(poses.t_ns) < LEAST_TURNS:
+    def __init__(self, poses: Truth, period_ns: float) -> None:
+        """`period_ns` is the median step between the samples."""
+        self._poses, self._gap_ns, self._samples = poses, GAP_FACTOR * period_ns, 0
+        self._turned = np.full((len(poses.t_ns), 3), np.nan)  # from the first sample to each pose
+        self._gaps = [np.zeros((0, 2), np.int64)]
+        self._first_ns, self._last_ns = 0, 0
+        self._last: tuple[Float64[np.ndarray, "1 3"], Float64[np.ndarray, "1 3"]] | None = None  # rate, and turn so far
+
+    @np.errstate(over="ignore", invalid="ignore")  # of rates that no sensor reads
+    def see(self, t_ns: Int64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"]) -> None:
+        """Add the next samples, in order of time."""
+        if not len(t_ns):
+            return
+        if self._last is None:
+            self._first_ns, turned = int(t_ns[0]), np.zeros((1, 3))
+        else:
+            t_ns, gyro = np.append(self._last_ns, t_ns), np.concatenate([self._last[0], gyro])
+            turned = self._last[1]
+        t, steps = seconds(t_ns, self._first_ns), np.diff(t_ns)
+        turned = np.cumsum(np.concatenate([turned, np.diff(t)[:, None] * (gyro[1:] + gyro[:-1]) / 2.0]), axis=0)
+        first, end = np.searchsorted(self._poses.t_ns, t_ns[0]), np.searchsorted(self._poses.t_ns, t_ns[-1], side="right")
+        at = seconds(self._poses.t_ns[first:end], self._first_ns)
+        for axis, column in enumerate(turned.T):
+            self._turned[first:end, axis] = np.interp(at, t, column)
+        gap = steps > self._gap_ns
+        self._gaps.append(np.stack([t_ns[:-1][gap], t_ns[1:][gap]], axis=1))
+        self._samples += len(t_ns) - (self._last is not None)
+        self._last_ns, self._last = int(t_ns[-1]), (gyro[-1:], turned[-1:])
+
+    def agreement(self) -> Agreement | None:
+        """Agreement of the turns of poses with the gyro; None where the two share too little motion.
+
+        gyro = b + R omega, with the constant bias b and rotation R that fit best (Kabsch), over intervals of a tenth of a
+        second without a gap of the IMU. A few jumps of the poses are counted, and left out of all other figures.
+        """
+        poses = self._poses
+        if self._samples < LEAST_TURNS or len(poses.t_ns) < LEAST_TURNS:
+            return None
+        start_ns, end_ns, rate = turning(poses)
+        steps = (end_ns - start_ns).astype(float)
+        inside = (start_ns >= self._first_ns) & (end_ns <= self._last_ns) & (steps < 4.0 * median(steps))
+        inside &= np.isfinite(rate).all(axis=1)
+        gaps = np.concatenate(self._gaps)
+        inside &= np.searchsorted(gaps[:, 0], end_ns) <= np.searchsorted(gaps[:, 1], start_ns, side="right")
+        if inside.sum() < LEAST_TURNS:
+            return None
+        begin, end = (seconds(t_ns[inside], self._first_ns) for t_ns in (start_ns, end_ns))
+        mean = (self._turned[1:] - self._turned[:-1])[inside] / (end - begin)[:, None]
+        return _agreement(mean, rate[inside], begin, end)
+
+
+def agreement(poses: Truth, imu: Imu) -> Agreement | None:
+    """Agreement of poses with samples in memory, as `GyroTurns.agreement`."""
+    if len(imu) < LEAST_TURNS:
         return None
-    start_ns, end_ns, rate = turning(poses)
-    first, last = int(imu.t_ns[0]), int(imu.t_ns[-1])
-    steps = (end_ns - start_ns).astype(float)
-    inside = (start_ns >= first) & (end_ns <= last) & (steps < 4.0 * median(steps)) & np.isfinite(rate).all(axis=1)
-    inside &= ~_has_gap(imu.t_ns, start_ns, end_ns)
-    if inside.sum() < LEAST_TURNS:
-        return None
-    t, begin, end = (seconds(t_ns, first) for t_ns in (imu.t_ns, start_ns[inside], end_ns[inside]))
-    mean = np.empty((len(begin), 3))
-    for axis, w in enumerate(imu.gyro.T):
-        turned = np.concatenate([[0.0], np.cumsum(np.diff(t) * (w[1:] + w[:-1]) / 2.0)])
-        mean[:, axis] = (np.interp(end, t, turned) - np.interp(begin, t, turned)) / (end - begin)
+    turns = GyroTurns(poses, float(median(np.diff(imu.t_ns))))
+    for first in range(0, len(imu), BLOCK):
+        turns.see(imu.t_ns[first : first + BLOCK], imu.gyro[first : first + BLOCK])
+    return turns.agreement()
+
+
+def _agreement(
+    mean: Float64[np.ndarray, "n 3"],
+    rate: Float64[np.ndarray, "n 3"],
+    begin: Float64[np.ndarray, " n"],
+    end: Float64[np.ndarray, " n"],
+) -> Agreement | None:
+    """Agreement of mean rates of the gyro with those of the poses, between two times."""
     length_s, kept, jumps = end - begin, np.ones(len(begin), bool), np.zeros(0)
     for _ in range(REFITS):
-        gyro, omega = mean - mean[kept].mean(axis=0), rate[inside] - rate[inside][kept].mean(axis=0)
+        gyro, omega = mean - mean[kept].mean(axis=0), rate - rate[kept].mean(axis=0)
         turn = best_rotation(gyro[kept], omega[kept])
         misfit = np.linalg.norm(gyro - omega @ turn.T, axis=1)
         off_deg = np.degrees(misfit * length_s)
@@ -89,17 +142,6 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     if body is not None and body.std_deg.max() >= np.clip(UNSURE_SHARE * np.linalg.norm(body.deg), *UNSURE_DEG):
         body = None
     return Agreement(rms, explained, body, len(jumps), float(jumps.max(initial=0.0)))
-
-
-def _has_gap(
-    t_ns: Int64[np.ndarray, " n"], start_ns: Int64[np.ndarray, " m"], end_ns: Int64[np.ndarray, " m"]
-) -> Bool[np.ndarray, " m"]:
-    """Whether the samples have a gap inside each interval."""
-    steps = np.diff(t_ns).astype(float)
-    gaps = np.concatenate([[0], np.cumsum(steps > GAP_FACTOR * median(steps))])
-    before = np.clip(np.searchsorted(t_ns, start_ns, side="right") - 1, 0, len(steps))
-    after = np.clip(np.searchsorted(t_ns, end_ns, side="left"), 0, len(steps))
-    return np.asarray(gaps[after] > gaps[before])
 
 
 def body_warnings(topic: str, turned_deg: Sequence[float]) -> list[str]:
@@ -136,7 +178,7 @@ class Body(NamedTuple):
     frames: frozenset[str]
 
 
-def turned_body(log: Log, imu: Imu, topic: str) -> Body | None:
+def turned_body(log: Log, imu: ImuSamples, topic: str) -> Body | None:
     """Body of poses that is turned by more than `TURNED_DEG`."""
     found = _turned_in(log, imu, topic)
     if found is None or not body_warnings(topic, found.deg.tolist()):
@@ -144,16 +186,20 @@ def turned_body(log: Log, imu: Imu, topic: str) -> Body | None:
     return body_of(log, topic, quaternion.matrix(quaternion.exp(np.radians(found.deg)[None]))[0])
 
 
-def is_straight(log: Log, imu: Imu, topic: str) -> bool:
+def is_straight(log: Log, imu: ImuSamples, topic: str) -> bool:
     """Whether an IMU shows that it lies as the body of poses does."""
     found = _turned_in(log, imu, topic)
     return found is not None and not body_warnings(topic, found.deg.tolist())
 
 
-def _turned_in(log: Log, imu: Imu, topic: str) -> Turned | None:
+def _turned_in(log: Log, imu: ImuSamples, topic: str) -> Turned | None:
     """Rotation of the body of poses in a log; None where they do not show it."""
-    poses = read_truth(log, topics=[topic])
-    found = None if poses is None else agreement(poses, imu)
+    if (poses := read_truth(log, topics=[topic])) is None:
+        return None
+    turns = GyroTurns(poses, imu.sound.steps.median())
+    for samples in imu:
+        turns.see(samples.stamp_ns, samples.values[:, :3])
+    found = turns.agreement()
     return None if found is None else found.turned
 
 
@@ -193,6 +239,11 @@ def velocities_judged(recording: Recording) -> Recording:
     """The recording; a warning of velocities that `strapdown.with_velocity` does not use."""
     for topic, poses in [*recording.truths.items()][:1]:
         if not velocity_follows(poses):
-            what = "%s: the velocities of %s do not follow its positions (body axes, another unit); the positions give them"
-            logger.warning(what, recording.name, topic)
+            warn_of_velocities(recording.name, topic)
     return recording
+
+
+def warn_of_velocities(name: str, topic: str) -> None:
+    """Warn of velocities that do not follow the positions of a topic."""
+    what = "%s: the velocities of %s do not follow its positions (body axes, another unit); the positions give them"
+    logger.warning(what, name, topic)

@@ -26,7 +26,8 @@ from imutool.inertial.aids import WHEELS, Aids, Odometry
 from imutool.inertial.metrics import align
 from imutool.inertial.preintegration import hat
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
-from imutool.log_info.convention_report import convention_summary, coverage
+from imutool.log_info.convention_report import convention_summary
+from imutool.log_info.pose_coverage import coverage
 from imutool.log_info.pose_imu_rotation import agreement, motion_warnings, unlike
 from imutool.mcap_io.codec.schemas import MESSAGE_TWISTS, TF
 from imutool.mcap_io.fields import numbers
@@ -80,7 +81,7 @@ def with_odometry(found: Aids, log: Log, recording: Recording, name: str) -> Aid
 
 def cover(imu: Imu, t_ns: Int64[np.ndarray, " n"]) -> str:
     """Words on an aid that measures for a part of the time alone."""
-    share = coverage("", "", t_ns, imu.t_ns).coverage
+    share = coverage("", "", t_ns, [imu.t_ns]).coverage
     return f", {share:.0%} of the time" if isinstance(share, float) and share < MOST_OF_TIME else ""
 
 

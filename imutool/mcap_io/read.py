@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from imutool.array_types import Float64, Int64, UInt32
 from imutool.errors import LogError
 from imutool.file_location import Location, log_name
 from imutool.mcap_io.codec import messages, schemas
-from imutool.mcap_io.codec.decode import decode_image
+from imutool.mcap_io.frames import read_frames
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import (
     CLEAN_FIX,
@@ -28,7 +27,7 @@ from imutool.mcap_io.topics import (
     check_finite,
 )
 from imutool.mcap_io.write import own_and_user_metadata
-from imutool.recording import UNIT_QUATERNION_TOLERANCE, Frames, Imu, Poses, Recording, Scalars, unit_quaternions
+from imutool.recording import UNIT_QUATERNION_TOLERANCE, Imu, Poses, Recording, Scalars, unit_quaternions
 from imutool.recording.columns import ClockRun, clock_jumps, clock_runs, jump_warnings
 
 logger = logging.getLogger(__name__)
@@ -74,12 +73,15 @@ def read_recordings(
     end_ns: int | None = None,
     samples: Imu | None = None,
     derived: bool = True,
+    images: bool = True,
     refused: Callable[[str, LogError], None] | None = None,
+    warn: Callable[..., None] = logger.warning,
 ) -> list[Recording]:
     """Recordings of an open log, one for each stretch in which its clock is not set back.
 
     With `samples` those are the IMU's, and its messages are not read. With `refused`, poses that a recording cannot hold are
     left out and `refused` is called with topic and error. Without `derived` the scalars that imutool computed are not read.
+    `warn` is called with what a warning says.
 
     Raises:
         LogError: as `read`.
@@ -92,7 +94,7 @@ def read_recordings(
     scalars = [t.name for t in numbers if t.name not in velocities]
     used = {name: of for name, of in velocities.items() if of in truths}
     others = {t: k for t in (*log.pose_topics, *truths) if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths}
-    columns = _Columns(log, imu_topic, truths, used, scalars, refused)
+    columns = _Columns(log, imu_topic, truths, used, scalars, refused, warn)
     with log.named():
         for topic, rows in log.rows(columns.topics[0 if samples is None else 1 :], start_ns, end_ns):
             columns.take(topic, rows)
@@ -103,7 +105,7 @@ def read_recordings(
             imu=columns.imu() if samples is None else samples,
             truths=columns.truths(truth),
             scalars=columns.scalars(),
-            frames=_frames(log, start_ns, end_ns),
+            frames=read_frames(log, start_ns, end_ns) if images else {},
             metadata=metadata,
             imu_topic=imu_topic,
             source=own.get("source", ""),
@@ -136,6 +138,7 @@ class _Columns:
     velocity_topics: Mapping[str, str]  # the poses that each is of
     scalar_topics: list[str]
     refused: Callable[[str, LogError], None] | None
+    warn: Callable[..., None]
     kept: dict[str, list[tuple[np.ndarray, ...]]] = field(default_factory=dict)  # columns, by topic
     left_out: set[str] = field(default_factory=set)
     lost: Counter[str] = field(default_factory=Counter)  # poses that are none, by topic
@@ -164,7 +167,7 @@ class _Columns:
                 for scalar in self.log.topics[topic].decode_scalars(rows):
                     self._keep(topic, scalar.sequence, scalar.stamp_ns, scalar.values)
             except LogError as error:
-                logger.warning("%s %s is left out: %s", self.log.path, topic, error.what)
+                self.warn("%s %s is left out: %s", self.log.path, topic, error.what)
                 self.left_out.add(topic)
 
     def _take_poses(self, topic: str, rows: messages.Rows) -> None:
@@ -199,7 +202,7 @@ class _Columns:
         parts = self.kept.get(self.imu_topic, []) if samples is None else [(samples.t_ns,)]
         stamp_ns = np.concatenate([np.zeros(0, np.int64), *(part[0] for part in parts)])
         for warning in jump_warnings(clock_jumps(stamp_ns)) if samples is None else ():
-            logger.warning("%s %s: %s", self.log.path, self.imu_topic, warning)
+            self.warn("%s %s: %s", self.log.path, self.imu_topic, warning)
         for run in clock_runs(stamp_ns):
             self.run = run
             yield run
@@ -243,7 +246,7 @@ class _Columns:
                 what = f"{self.lost[name]} of {self.lost[name] + len(stamp_ns)} poses are lost (NaN, or a quaternion of zero)"
                 if not len(stamp_ns):
                     raise LogError(what, expected="poses of a tracked body")
-                logger.warning("%s %s: %s and left out", self.log.path, name, what)
+                self.warn("%s %s: %s and left out", self.log.path, name, what)
             away = np.abs(np.linalg.norm(q_wb_wxyz, axis=1) - 1.0) > UNIT_QUATERNION_TOLERANCE
             if away.any():  # rows that a recording takes as they are keep every bit
                 q_wb_wxyz = np.where(away[:, None], unit_quaternions(q_wb_wxyz), q_wb_wxyz)
@@ -254,7 +257,7 @@ class _Columns:
                 if not len(both) and len(stamp_ns):
                     raise LogError(f"the velocities on {topic} have other stamps than the poses")
                 if alone := len(stamp_ns) - len(both):  # a damaged log ends between the two
-                    logger.warning("%s %s: poses without a velocity are left out: %d", self.log.path, name, alone)
+                    self.warn("%s %s: poses without a velocity are left out: %d", self.log.path, name, alone)
                 stamp_ns, p_wb, q_wb_wxyz, v_w = stamp_ns[both], p_wb[both], q_wb_wxyz[both], v_w[rows]
             return Poses(stamp_ns, p_wb, q_wb_wxyz, v_w)
 
@@ -265,35 +268,7 @@ class _Columns:
             try:
                 stamp_ns, (values,) = self.columns(name, SCALARS[described.schema_name])
             except LogError as error:
-                logger.warning("%s %s is left out: %s", self.log.path, name, error.what)
+                self.warn("%s %s is left out: %s", self.log.path, name, error.what)
                 continue
             found[name] = Scalars(stamp_ns, values, described.metadata.get(UNIT_KEY, ""))
         return found
-
-
-def _frames(log: Log, start_ns: int | None, end_ns: int | None) -> dict[str, Frames]:
-    """Image topics, opened again when somebody reads them; none whose first message is no image."""
-    found, first, last = {}, start_ns or 0, 2**63 - 1 if end_ns is None else end_ns
-    for topic in (t.name for t in log.with_schema((schemas.IMAGE,)) if t.message_encoding in ENCODINGS):
-        if (form := _format(log, topic)) is not None:
-            count = sum(int(((t >= first) & (t <= last)).sum()) for t in log.stamps(topic))
-            found[topic] = Frames(form, count, partial(_images, log.path, topic, start_ns, end_ns))
-    return found
-
-
-def _format(log: Log, topic: str) -> str | None:
-    """Image format, from the first image; None where it is no image."""
-    payload = log.first(topic)
-    try:
-        return "" if payload is None else decode_image(payload, log.topics[topic].message_encoding)[1]
-    except LogError as error:
-        logger.warning("%s %s is left out: %s", log.path, topic, error.what)
-        return None
-
-
-def _images(path: Location, topic: str, start_ns: int | None, end_ns: int | None) -> Iterator[tuple[int, bytes]]:
-    with Log(path) as log:
-        encoding = log.topic(topic, (schemas.IMAGE,)).message_encoding
-        for _, rows in log.rows([topic], start_ns, end_ns):
-            with log.named(topic):
-                yield from (decode_image(payload.tobytes(), encoding)[::2] for payload in rows.payload)

@@ -12,6 +12,7 @@ import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from imutool.conversion.run import convert
 from imutool.converters import euroc
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, ImutoolError, LogError
+from imutool.exporting import log_parts
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
@@ -40,6 +42,7 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 START_NS = 1_403_636_580_838_555_648
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0"
 IMAGE_BYTES = 400_000
+ROWS, MOST_BYTES = 10_000, 60  # bytes a sample at 2 kHz: the evidence of tenths of a second; a sample and a pose have 120
 NUMBERS = st.floats(-1e300, 1e300, allow_nan=False)
 
 
@@ -213,6 +216,59 @@ def test_a_truth_without_velocity_comes_back_without(tmp_path: Path) -> None:
     again = back(tmp_path / "bare")
     assert dict(again.truths) == {"/ground_truth/pose": bare}
     assert dict(again.scalars) == {}
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def alike_in_parts(log: Path, monkeypatch: pytest.MonkeyPatch, parts: int) -> bool:
+    """Whether a log exported in parts gives the same files and report; it takes at least so many parts."""
+    whole = export(log, log.parent / "whole", format="euroc")
+    read, taken = log_parts.read_recordings, list[int]()
+
+    def counted(*args: Any, **settings: Any) -> list[Recording]:
+        found = read(*args, **settings)
+        taken.append(len(found))
+        return found
+
+    monkeypatch.setattr(log_parts, "PART_ROWS", 64)
+    monkeypatch.setattr(log_parts, "read_recordings", counted)
+    found = export(log, log.parent / "parts", format="euroc")
+    assert len(taken) >= parts
+    same = found.written == whole.written and set(found.left_out) == set(whole.left_out)
+    return same and files(log.parent / "parts") == files(log.parent / "whole")
+
+
+def test_a_log_in_parts_gives_the_same_folder(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert alike_in_parts(log, monkeypatch, 6)
+
+
+def test_a_bias_that_leaves_the_stamps_of_the_poses_late_gives_the_same_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = whole()
+    name = "/ground_truth/bias/gyro"
+    t_ns = recording.scalars[name].t_ns.copy()
+    t_ns[-1] += 1
+    late = {**recording.scalars, name: replace(recording.scalars[name], t_ns=t_ns)}
+    write(replace(recording, scalars=late), tmp_path / "log.mcap")
+    assert alike_in_parts(tmp_path / "log.mcap", monkeypatch, 6)
+
+
+def test_memory_does_not_grow_with_the_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log_parts, "PART_ROWS", 1 << 12)
+    peaks = []
+    for count in (ROWS, 5 * ROWS):
+        t_ns, rng = START_NS + 500_000 * np.arange(count), np.random.default_rng(1)
+        imu = Imu(t_ns, rng.normal(size=(count, 3)), rng.normal([0.0, 0.0, 9.8], size=(count, 3)))
+        still = Poses(t_ns, np.zeros((count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
+        write(Recording("log", imu, truths={"/ground_truth/pose": still}), tmp_path / f"{count}.mcap")
+        tracemalloc.start()
+        export(tmp_path / f"{count}.mcap", tmp_path / str(count), format="euroc")
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] - peaks[0] < MOST_BYTES * 4 * ROWS
 
 
 def test_jpeg_keeps_its_ending_and_what_is_no_image_is_refused(tmp_path: Path) -> None:

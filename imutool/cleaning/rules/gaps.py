@@ -126,9 +126,8 @@ def missing(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Float64[np.n
     return np.where(is_lost, np.round(periods - 1.0), 0.0)
 
 
-def pause_words(stamp_ns: Int64[np.ndarray, " n"]) -> list[str]:
-    """Pauses of the recorder, in words; a longer step is a jump of the clock."""
-    steps = np.diff(stamp_ns)
-    pauses = steps[(steps > PAUSE_NS) & (steps <= nanoseconds(MOST_GAP_S))]
+def pause_words(steps_ns: Int64[np.ndarray, " n"]) -> list[str]:
+    """Pauses of the recorder among steps of stamps; a longer step is a jump of the clock."""
+    pauses = steps_ns[(steps_ns > PAUSE_NS) & (steps_ns <= nanoseconds(MOST_GAP_S))]
     longest = f", the longest of {pauses.max() * 1e-9:.0f} s" if len(pauses) else ""
     return [f"pauses of more than {PAUSE_NS * 1e-9:g} s: {len(pauses)}{longest}"] if longest else []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -146,20 +147,46 @@ class Plateau:
         return side * float(median(value[quiet])), number[quiet], stamp_ns[quiet]
 
 
+class AxisLimits:
+    """Limits of axes, by `RULE`, from samples in blocks."""
+
+    def __init__(self, axes: int) -> None:
+        self._ends, self._plateaus = [Ends() for _ in range(axes)], [Plateau() for _ in range(axes)]
+
+    def see(self, values: Float64[np.ndarray, "n k"], number: Numbers) -> None:
+        """Add the next samples."""
+        for column, ends, plateau in zip(values.T, self._ends, self._plateaus, strict=True):
+            ends.see(column)
+            plateau.see(column, number, number)
+
+    @cached_property
+    def _found(self) -> tuple[list[list[float]], Numbers]:
+        """Limits of each axis, and numbers of the samples that are flat near one; known once all samples are."""
+        levels: list[list[float]] = [[] for _ in self._ends]
+        flat = [np.zeros(0, np.int64)]
+        for side, (axis, ends) in product((-1, 1), enumerate(self._ends)):
+            if (limit := ends.limit(side)) is not None:
+                levels[axis].append(limit)
+            elif (near := self._plateaus[axis].flat(side)) is not None:
+                flat.append(near[1])
+        return levels, np.concatenate(flat)
+
+    def reached(self, values: Float64[np.ndarray, "n k"], number: Numbers) -> Bool[np.ndarray, " n"]:
+        """Samples with an axis at its limit, once all samples were added."""
+        levels, flat = self._found
+        at = np.isin(number, flat)
+        for column, limits in zip(values.T, levels, strict=True):
+            for limit in limits:
+                at |= column == limit
+        return at
+
+
 def at_limit(values: Float64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     """Saturated samples of an axis, by `RULE`."""
-    ends, plateau, found = Ends(), Plateau(), np.zeros(len(values), bool)
+    limits, number = AxisLimits(1), np.arange(len(values))
     for first in range(0, len(values), PART):
-        block = values[first : first + PART]
-        number = first + np.arange(len(block))
-        ends.see(block)
-        plateau.see(block, number, number)
-    for side in (-1, 1):
-        if (limit := ends.limit(side)) is not None:
-            found |= values == limit
-        elif (flat := plateau.flat(side)) is not None:
-            found[flat[1]] = True
-    return found
+        limits.see(values[first : first + PART, None], number[first : first + PART])
+    return limits.reached(values[:, None], number)
 
 
 class Saturation(Rule):

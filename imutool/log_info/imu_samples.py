@@ -1,0 +1,155 @@
+"""Samples of a log's IMU in blocks, in order of time, as often as they are needed.
+
+The first pass finds whether the stamps increase and come one by one. Then only a block is in memory. Otherwise all stamps are,
+with the order of the samples, and the samples that came too early.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from imutool.array_types import Float64, Int64
+from imutool.cleaning import raw_batches
+from imutool.cleaning.rules.gaps import missing
+from imutool.cleaning.rules.not_finite import measured
+from imutool.cleaning.rules.saturation import AxisLimits
+from imutool.cleaning.samples import Samples, blocks, joined
+from imutool.cleaning.stamp_line import SPAN, Stamps, distinct, read_stamps, restamped, usual_period
+from imutool.log_info.clock import IncreasingStamps, SensorStamps, sorted_stamps
+from imutool.log_info.report import Interval
+from imutool.mcap_io.log import Log
+from imutool.recording import nanoseconds
+from imutool.recording.columns import clock_jumps
+
+APART_NS = nanoseconds(60.0)  # of stretches that are read by themselves
+ROUNDING_NS = 1024  # of times as floats
+MARGIN = SPAN + 1  # stamps on both sides that show whether a step lost samples
+NO_FAULTS = Stamps(np.zeros(0, np.int64), "", Counter(), 1.0, unset=False)
+
+
+class ImuSamples:
+    """Finite samples of an IMU in order of time, each stamp once.
+
+    Attributes:
+        counts: messages with a defect by its name; `missing` and `saturated` are complete after `counted`.
+        recorded: messages, and their stamps, in order of time.
+        sound: stamps of the samples.
+        stamps, jumps: faults of the stamps, and jumps of their clock.
+    """
+
+    def __init__(self, log: Log, topic: str) -> None:
+        """Reads the IMU once.
+
+        Raises:
+            LogError: no such IMU topic, another encoding, or damage.
+        """
+        self._log, self._topic = log, topic
+        self._limits = AxisLimits(6)
+        self._rank: Int64[np.ndarray, " n"] | None = None  # of each message among the samples, -1 of those that are none
+        self._lag_ns = np.inf, -np.inf  # of the log times behind the stamps
+        recorded, self.sound = SensorStamps(), IncreasingStamps()
+        self.stamps, messages, finite = NO_FAULTS, 0, 0
+        for samples in self._read():
+            good = measured(samples.values)
+            recorded.see(samples.stamp_ns)
+            self.sound.see(samples.stamp_ns[good])
+            self._limits.see(samples.values[good], finite + np.arange(good.sum()))
+            messages, finite = messages + len(good), finite + int(good.sum())
+            lag_ns = samples.log_ns.astype(np.float64) - samples.stamp_ns
+            self._lag_ns = min(self._lag_ns[0], lag_ns.min()), max(self._lag_ns[1], lag_ns.max())
+        self.recorded: IncreasingStamps = recorded
+        self.jumps, self._period_ns = recorded.jumps, recorded.period_ns
+        self.counts = {"out_of_order": 0, "duplicated": 0, "missing": 0, "not_finite": messages - finite, "saturated": 0}
+        if not recorded.sound:
+            self._hold_stamps()
+
+    def __len__(self) -> int:
+        return self.sound.count
+
+    @property
+    def period_s(self) -> float:
+        """Median step between the samples."""
+        return self.sound.steps.median() * 1e-9
+
+    def _read(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Samples]:
+        return blocks(raw_batches(self._log, self._topic, start_ns, end_ns))
+
+    def _hold_stamps(self) -> None:
+        """Reads all stamps into memory, and settles the order of the samples."""
+        parts = [(samples.stamp_ns.copy(), measured(samples.values)) for samples in self._read()]
+        t_ns = np.concatenate([np.zeros(0, np.int64), *(stamps for stamps, _ in parts)])
+        rows = np.flatnonzero(np.concatenate([np.zeros(0, bool), *(good for _, good in parts)]))
+        self.stamps, self.jumps, self.recorded = read_stamps(t_ns), clock_jumps(t_ns), sorted_stamps(t_ns)
+        self.counts["out_of_order"] = int((t_ns < np.maximum.accumulate(t_ns)).sum()) if len(t_ns) else 0
+        self.counts["duplicated"] = len(t_ns) - len(distinct(t_ns))
+        line = distinct(restamped(t_ns) if self.stamps.batch > 1.0 or self.stamps.fraction else t_ns)
+        self.counts["missing"] = int(missing(line, usual_period(line)).sum()) if len(line) > 1 else 0
+        ordered, first = np.unique(t_ns[rows], return_index=True)
+        self._rank = np.full(len(t_ns), -1)
+        self._rank[rows[first]] = np.arange(len(first))
+        self.sound = IncreasingStamps()
+        self.sound.see(ordered)
+
+    def __iter__(self) -> Iterator[Samples]:
+        return self._in_order(self._read())
+
+    def counted(self) -> Iterator[Samples]:
+        """The samples; their defects are counted as they come."""
+        stream = self._read()
+        yield from self._in_order(self._reached(stream if self._rank is not None else self._lost(stream)))
+
+    def _lost(self, stream: Iterable[Samples]) -> Iterator[Samples]:
+        """Counts the samples that are missing between stamps that increase."""
+        t_ns, judged = np.zeros(0, np.int64), 0
+        for samples in stream:
+            yield samples
+            t_ns = np.concatenate([t_ns, samples.stamp_ns])
+            end = max(judged, len(t_ns) - 1 - MARGIN)
+            if end > judged:
+                self.counts["missing"] += int(missing(t_ns, self._period_ns)[judged:end].sum())
+            t_ns, judged = t_ns[max(end - MARGIN, 0) :], min(end, MARGIN)
+        if len(t_ns) > 1:
+            self.counts["missing"] += int(missing(t_ns, self._period_ns)[judged:].sum())
+
+    def _reached(self, stream: Iterable[Samples]) -> Iterator[Samples]:
+        """Counts the samples that reach the limit of an axis."""
+        finite = 0
+        for samples in stream:
+            yield samples
+            values = samples.values[measured(samples.values)]
+            self.counts["saturated"] += int(self._limits.reached(values, finite + np.arange(len(values))).sum())
+            finite += len(values)
+
+    def _in_order(self, stream: Iterable[Samples]) -> Iterator[Samples]:
+        """Finite samples in order of time."""
+        waiting, sent = list[Samples](), 0
+        for samples in stream:
+            if self._rank is None:
+                good = measured(samples.values)
+                yield samples if good.all() else samples.where(good)
+                continue
+            rank = self._rank[samples.number]
+            whole = joined([*waiting, samples._replace(number=rank).where(rank >= 0)])
+            whole = whole.where(np.argsort(whole.number))
+            ready = int((whole.number == sent + np.arange(len(whole.number))).sum())
+            yield whole.where(slice(ready))
+            waiting, sent = [whole.where(slice(ready, None))], sent + ready
+
+    def within(self, stretches: Sequence[Interval]) -> Iterator[tuple[int, Float64[np.ndarray, "n 6"]]]:
+        """Parts of stretches of time that are in order and disjoint: number of the stretch, and samples."""
+        first_ns, last_ns = np.array([(s.first_ns, s.last_ns) for s in stretches], np.int64).reshape(-1, 2).T
+        cuts = (np.flatnonzero(first_ns[1:] - last_ns[:-1] > APART_NS) + 1).tolist()
+        for a, b in pairwise([0, *(cuts if self._rank is None else []), len(stretches)]):
+            start_ns, end_ns = (
+                int(first_ns[a] + self._lag_ns[0]) - ROUNDING_NS,
+                int(last_ns[b - 1] + self._lag_ns[1]) + ROUNDING_NS,
+            )
+            for samples in self._in_order(self._read(start_ns, end_ns) if self._rank is None else self._read()):
+                of = a + np.searchsorted(first_ns[a:b], samples.stamp_ns, side="right") - 1
+                of[(of < a) | (samples.stamp_ns > last_ns[of])] = -1
+                for stretch in np.unique(of[of >= 0]).tolist():
+                    yield stretch, samples.values[of == stretch]
