@@ -22,7 +22,7 @@ from ._table_merged import join_stamps, sort_by_clock
 from ._table_mocap import is_mocap, read_mocap
 from ._table_names import is_of_recordings, is_of_sensors
 from ._table_numbers import is_number
-from ._table_packed import opener, read_bytes, text_head
+from ._table_packed import read_bytes, text_head
 from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated
 from ._table_sensors import read_rows
 from ._table_sheets import load_sheets
@@ -56,7 +56,7 @@ def kind_of(head: bytes, path: Path) -> str:
             return sheets
         if any(name.endswith(".npy") for name in names):
             return "npz"
-    text = text_head(path) if opener(head) else head
+    text = text_head(path)
     words = "" if b"\0" in text else text_of(text)
     if is_json(words):
         return "json"
@@ -96,7 +96,7 @@ def names_of(path: Path) -> list[str]:
     start = head(path)
     kind = kind_of(start, path)
     if kind == "csv":
-        lines = text_of(text_head(path) if opener(start) else start).splitlines()[:FIRSTS]
+        lines = text_of(text_head(path)).splitlines()[:FIRSTS]
         return [field.strip(' "#') for line in lines for field in re.split(r"[;,\t]", line) if not is_number(field)]
     if kind in ("parquet", "feather"):
         with refusing(path), path.open("rb") as source:

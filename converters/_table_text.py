@@ -32,8 +32,8 @@ from ._table_numbers import (
     vector,
     vectors,
 )
+from ._table_packed import UTF16
 
-UTF16 = b"\xff\xfe", b"\xfe\xff"
 WIDEST = 64  # columns of a matrix; wider ones are images
 MAX_LINE = 65_536
 LEAST_NUMBERS = 4  # in a row: a time and a vector

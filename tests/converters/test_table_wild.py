@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -559,3 +560,18 @@ def test_commas_behind_a_header_and_its_rows_hide_no_name(tmp_path):
     path = write_csv(tmp_path / "imu.csv", NAMES, [T_S, *ACCEL_G.T, *(COUNTS * 0.07).round(2).T])
     path.write_text("".join(f"{line},,,\n" for line in path.read_text().splitlines()))
     assert len(read(path).imus["/imu0"]) == COUNT
+
+
+@pytest.mark.parametrize("is_packed", [False, True])
+@pytest.mark.parametrize("is_in_folder", [False, True])
+def test_a_table_of_hundreds_of_columns_is_one(tmp_path, is_packed, is_in_folder):
+    """Its header and first row are longer than what shows most tables."""
+    joints = [f"joint_{number}_angle (deg)" for number in range(400)]
+    names = ["time (s)", *(f"gyro_{a} (rad/s)" for a in "xyz"), *(f"acc_{a} (g)" for a in "xyz"), *joints]
+    values = [T_S, *(0.01 * COUNTS).T, *ACCEL_G.T, *np.round(RNG.normal(0.0, 30.0, (400, COUNT)), 4)]
+    path = write_csv(tmp_path / "imu.csv", names, values)
+    if is_packed:
+        (tmp_path / "imu.csv.gz").write_bytes(gzip.compress(path.read_bytes()))
+        path.unlink()
+    log = read(tmp_path if is_in_folder else next(tmp_path.iterdir()))
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, 0.01 * COUNTS)
