@@ -255,7 +255,7 @@ def _load_hdf5(path: Path, columns: Columns) -> None:
         if node.external or node.is_virtual:
             raise DataError(f"{name} lies in another file", where=path, fix="Copy it into this file")
         check_size(path, node.size * 8)
-        unit = node.attrs.get("units", node.attrs.get("unit", ""))
+        unit = next((value for key, value in node.attrs.items() if key.lower() in ("unit", "units")), "")
         columns.add(name, node[()], _plain(unit))
 
     with h5py.File(path, "r") as file:

@@ -41,10 +41,10 @@ CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration
 WHOLE_WORDS = "gyr|acc|time"  # that begin behind capitals
 DIGITS = str.maketrans("012", "xyz")
 WORDS = {
-    "gyro": r"gyro(scope)?|gyro_?rotation|gyroskop|gyr|gyros|gy|omega|w|(?<![pqrvc]_)wb|g|angular_?velocity|ang_?vel"
+    "gyro": r"gyro(scope)?s?|gyro_?rotation|gyroskop|gyr|gy|omega|w|(?<![pqrvc]_)wb|g|angular_?velocity|ang_?vel"
     r"|(rotation_?)?rate|rate_of_rotation|w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?|gyro_?adc|gyro_rad",
-    "accel": r"accel(eration|erometer)?|acc[el]?|ac|(?<![pr]_[a-z]{2}_)a|fb|g_?force|gf|linear_?acceleration|specific_?force"
-    r"|sp_?force|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
+    "accel": r"accel((eration|erometer)s?)?|acc[el]?|ac|(?<![pr]_[a-z]{2}_)a|fb|g_?force|gf|linear_?acceleration"
+    r"|specific_?force|sp_?force|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
 }
 STATES = r"_(raw|adc|counts?|(un)?cal(ib)?(rated)?)"  # of the numbers in a column
 STATE = rf"(?P<state>({STATES})?)"

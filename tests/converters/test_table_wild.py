@@ -575,3 +575,28 @@ def test_a_table_of_hundreds_of_columns_is_one(tmp_path, is_packed, is_in_folder
         path.unlink()
     log = read(tmp_path if is_in_folder else next(tmp_path.iterdir()))
     np.testing.assert_allclose(log.imus["/imu0"].gyro, 0.01 * COUNTS)
+
+
+def test_units_and_states_behind_the_names_of_numbers_are_no_names(tmp_path):
+    """`16555014.81m` is a number with its unit, and `GPS: NO_FIX` holds no number: both may change from row to row."""
+    form = (
+        "2025-10-04 16:35:{:06.3f},EULER(deg): R=1.70,P=9.24,GYRO: X={:.4f},Y={:.4f},Z={:.4f},"
+        "ACCEL: X={:.4f},Y={:.4f},Z={:.4f},ALT: {:.2f}m,GPS: {},SAT=4,iTOW={}ms"
+    )
+    rows = [
+        form.format(0.1 * n, *(0.01 * COUNTS[n]), *(9.8 * ACCEL_G[n]), 100.0 + n, ("NO_FIX", "3D_FIX")[n % 2], 200 * n)
+        for n in range(COUNT)
+    ]
+    (tmp_path / "log.txt").write_text("\n".join(rows) + "\n")
+    (found,) = table.sequences(tmp_path / "log.txt")
+    log = table.read_sequence(found, mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, 0.01 * COUNTS, atol=1e-9)
+    assert not log.remarks.losses
+    assert log.scalars["/ALT_m"].unit == "m"
+
+
+def test_a_few_whole_numbers_are_no_gravity(tmp_path):
+    """Counts of an acceleration without gravity may have a median of 10."""
+    counts = np.round(RNG.normal([0.0, -10.0, -4.0], 1.0, (COUNT, 3)))
+    with pytest.raises(ConfigError, match="state no unit of the accel that imutool knows, and its values show none"):
+        read(write_csv(tmp_path / "imu.csv", NAMES, [T_S, *counts.T, *(COUNTS / 16).T]))
