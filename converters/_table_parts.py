@@ -6,6 +6,7 @@ recording where they have times in common.
 
 from __future__ import annotations
 
+import copy
 import re
 from collections.abc import Callable
 from functools import lru_cache
@@ -46,7 +47,7 @@ def load_table(path: Path, inside: str) -> Columns:
     if not _may_hold_several(path):
         return load(path, kind_of(head(path), path), inside)
     whole = _loaded(path)
-    columns = _with_rows(whole, _parts(whole)[inside], is_of_recordings if inside else None)
+    columns = _with_rows(whole, _parts(whole)[inside], is_of_recordings) if inside else copy.deepcopy(whole)
     sensors = _labels(columns, is_of_sensors)
     return _grouped(columns, sensors) if sensors and _share_time(columns, sensors) else columns
 

@@ -135,3 +135,15 @@ def test_rows_are_not_counted_across_a_time_or_counter_that_begins_anew(tmp_path
 def test_a_counter_of_a_few_bits_or_digits_is_counted_through(tmp_path, size):
     (gyro,) = logs(csv(tmp_path / "all.csv", {"packet": np.arange(PARTS * COUNT) % size}), {"rate_hz": RATE_HZ}).values()
     np.testing.assert_array_equal(gyro, VALUES[:, :3])
+
+
+def test_a_table_whose_columns_have_several_lengths_is_one_recording(tmp_path):
+    """As of cells with arrays in them; the same table is read twice."""
+    array, few = '"' + str([0.5] * 60) + '"', 50  # more numbers in a cell than rows
+    rows = [f"{n // 25},{array},{n / 100}," + ",".join(map(str, VALUES[n])) for n in range(few)]
+    (tmp_path / "all.csv").write_text(",".join(["id", "array", "time_s", *NAMES]) + "\n" + "\n".join(rows) + "\n")
+    (found,) = table.sequences(tmp_path / "all.csv")
+    for _ in range(2):
+        log = table.read_sequence(found)
+        np.testing.assert_array_equal(log.imus["/imu0"].gyro, VALUES[:few, :3])
+        assert len(log.remarks.notes) == len(set(log.remarks.notes))
