@@ -89,7 +89,7 @@ def load(path: Path, kind: str, sheet: str = "") -> Columns:
 
 
 def names_of(path: Path) -> list[str]:
-    """Names of the columns of a table with a header of text, or of Parquet or Feather, by its first bytes.
+    """Names of the columns of a table of text, Parquet or Feather, by its first bytes.
 
     Fields of further rows may be among them.
     """

@@ -216,7 +216,10 @@ def is_time(column: str) -> bool:
 
 
 def measured(columns: Columns) -> list[str]:
-    """Columns that may be a sensor's: no true poses, no parameters, which are shorter, and no raw counts beside the sensor."""
+    """Columns that may be a sensor's.
+
+    Poses that are true are none, nor are parameters, which are shorter, and raw counts beside what is calibrated.
+    """
     longest = max(map(len, columns.values.values()), default=0)
     long = [c for c, values in columns.values.items() if len(values) > MOST_CONSTANTS or longest <= MOST_CONSTANTS]
     counts = _raw_counts(columns)

@@ -108,7 +108,7 @@ def is_of_recordings(column: str) -> bool:
 
 
 def is_of_sensors(column: str) -> bool:
-    """Whether a column is named as one that tells sensors apart: `sensor`, `device_id`, `placement`."""
+    """Whether a column is named as one that tells sensors apart: `device_id`, `placement`."""
     return (
         re.fullmatch(rf"(({SENSORS})|(sensor|device|imu)_({SENSORS})){NUMBERED}|mac|address", spaced_name(column)) is not None
     )

@@ -43,7 +43,7 @@ def recordings_in(found: Sequence) -> list[Sequence]:
 
 
 def load_table(path: Path, inside: str) -> Columns:
-    """Columns of a table file, or of one of its recordings, in groups where it holds several sensors."""
+    """Columns of a table file, or of one of its recordings; several sensors are groups."""
     if not _may_hold_several(path):
         return load(path, kind_of(head(path), path), inside)
     whole = _loaded(path)
