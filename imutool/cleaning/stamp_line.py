@@ -144,7 +144,7 @@ def stay_late(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Bool[np.nd
 def lost_samples(stamp_ns: Int64[np.ndarray, " n"], period_ns: float, steps: Bool[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
     """Number of samples lost in each of `steps` behind which the stamps stay late.
 
-    Each is counted once. The earliest stamps on both sides show how many are lost. What is later than these is late; it is no loss.
+    Each is counted once. The earliest stamps on both sides show how many are lost. What is later than these is late, not lost.
     """
     lost, last = np.zeros(len(steps), np.int64), -1
     for row in np.flatnonzero(steps & stay_late(stamp_ns, period_ns)).tolist():
