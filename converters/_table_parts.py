@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from imutool.array_types import Int64
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
 
 from . import Sequence
 from ._source import head
@@ -36,9 +36,11 @@ Rows = Int64[np.ndarray, " n"]
 
 def recordings_in(found: Sequence) -> list[Sequence]:
     """The table as one recording, or those that its columns tell apart."""
-    if not found.path.is_file() or found.inside or not _may_hold_several(found.path):
+    try:
+        several = found.path.is_file() and not found.inside and _may_hold_several(found.path)
+        parts = _parts(_loaded(found.path)) if several else {}
+    except (ConfigError, DataError):  # said when it is read
         return [found]
-    parts = _parts(_loaded(found.path))
     return [Sequence(f"{found.name}_{name}", found.path, name) for name in parts] if len(parts) > 1 else [found]
 
 

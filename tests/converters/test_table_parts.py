@@ -11,7 +11,7 @@ import pytest
 from support.tables import write_csv
 
 from imutool.converters import table
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
 
 NAMES = [*(f"gyro_{a} (rad/s)" for a in "xyz"), *(f"acc_{a} (m/s^2)" for a in "xyz")]
 COUNT, PARTS, RATE_HZ = 200, 3, 50.0
@@ -147,3 +147,13 @@ def test_a_table_whose_columns_have_several_lengths_is_one_recording(tmp_path):
         log = table.read_sequence(found)
         np.testing.assert_array_equal(log.imus["/imu0"].gyro, VALUES[:few, :3])
         assert len(log.remarks.notes) == len(set(log.remarks.notes))
+
+
+def test_a_damaged_table_is_refused_when_it_is_read(tmp_path):
+    """The others of its folder are converted."""
+    columns = {"trial": PART, **TIMED, **dict(zip(NAMES, VALUES.T, strict=True))}
+    pyarrow.parquet.write_table(pyarrow.table(columns), path := tmp_path / "all.parquet")
+    path.write_bytes(path.read_bytes()[:-100])
+    (found,) = table.sequences(path)
+    with pytest.raises(DataError, match="cannot be read"):
+        table.read_sequence(found)
