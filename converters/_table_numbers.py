@@ -54,7 +54,8 @@ def plain_columns(lines: list[str], delimiter: str | None) -> tuple[list[np.ndar
 
 def _is_rounded_time(column: np.ndarray) -> bool:
     """Whether a column may be a time that float64 rounds; it seldom goes back."""
-    return column.dtype.kind == "f" and bool((np.abs(column) > EXACT).any() and np.mean(np.diff(column) < 0.0) < MOST_BACK)
+    is_large = column.dtype.kind == "f" and bool((np.abs(column) > EXACT).any())
+    return is_large and bool((np.diff(column) < 0.0).sum() <= MOST_BACK * len(column))
 
 
 def _count(line: str, delimiter: str | None) -> int:

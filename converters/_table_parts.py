@@ -115,7 +115,9 @@ def _clocks(columns: Columns, order: Rows, seams: Int64[np.ndarray, " k"]) -> li
     named = (values[order].astype(float) for name, values in columns.values.items() if _is_time(name))
     inside = np.delete(np.arange(len(order) - 1), seams - 1)
     steps = ((values, np.diff(values)[inside]) for values in named)
-    return [values for values, each in steps if np.mean(each >= 0.0) > NOT_BACK and np.mean(each > 0.0) > UP]
+    return [
+        values for values, each in steps if len(each) and min((each >= 0.0).mean() - NOT_BACK, (each > 0.0).mean() - UP) > 0.0
+    ]
 
 
 def _codes(labels: Labels) -> Rows:

@@ -114,6 +114,13 @@ def test_sensors_of_each_trial_are_imus_of_its_log(tmp_path):
     np.testing.assert_array_equal(read[1].imus["/right/imu"].gyro, VALUES[PART == 2][1::2, :3])
 
 
+def test_a_trial_of_one_row_has_no_time_that_goes_on(tmp_path):
+    trial = np.where(np.arange(PARTS * COUNT) == PARTS * COUNT - 1, 4, PART)
+    sensor = np.array(["left", "right"])[np.arange(PARTS * COUNT) % 2]
+    path = csv(tmp_path / "all.csv", {"trial": trial, "sensor": sensor, **TIMED})
+    assert [each.name for each in table.sequences(path)] == ["all_trial_1", "all_trial_2", "all_trial_3", "all_trial_4"]
+
+
 @pytest.mark.parametrize("beside", [{}, {"time_s": T_S + 10.0 * PART}])
 def test_sensors_that_share_no_time_are_logs_of_their_own(tmp_path, beside):
     path = csv(tmp_path / "all.csv", {"sensor": PART, **beside})
