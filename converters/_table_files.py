@@ -13,17 +13,20 @@ import numpy as np
 from imutool.errors import DataError, required
 
 from ._archive import refusing
+from ._source import head
 from ._table_echo import of_echo
 from ._table_headerless import as_table, name_headerless
 from ._table_json import is_json, load_json
 from ._table_mat import check_size, load_mat
 from ._table_merged import join_stamps, sort_by_clock
 from ._table_mocap import is_mocap, read_mocap
-from ._table_packed import opener, read_bytes, text_head
+from ._table_names import is_of_recordings, is_of_sensors
+from ._table_numbers import is_number
+from ._table_packed import read_bytes, text_head
 from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated
 from ._table_sensors import read_rows
 from ._table_sheets import load_sheets
-from ._table_text import WIDEST, Columns, is_text_table, read_csv, text_of
+from ._table_text import FIRSTS, WIDEST, Columns, is_text_table, no_numbers, read_csv, text_of
 from ._table_times import join_gps_weeks, read_serial_days
 
 NO_NUMBERS = "holds no columns of numbers"
@@ -53,7 +56,7 @@ def kind_of(head: bytes, path: Path) -> str:
             return sheets
         if any(name.endswith(".npy") for name in names):
             return "npz"
-    text = text_head(path) if opener(head) else head
+    text = text_head(path)
     words = "" if b"\0" in text else text_of(text)
     if is_json(words):
         return "json"
@@ -83,6 +86,24 @@ def load(path: Path, kind: str, sheet: str = "") -> Columns:
         why = "".join(f"; {loss}" for loss in columns.remarks.losses[:1])
         raise DataError(f"{NO_NUMBERS}{why}", where=path, expected="a time, three rates and three accelerations")
     return columns
+
+
+def names_of(path: Path) -> list[str]:
+    """Names of the columns of a table of text, Parquet or Feather, by its first bytes.
+
+    Fields of further rows may be among them.
+    """
+    start = head(path)
+    kind = kind_of(start, path)
+    if kind == "csv":
+        lines = text_of(text_head(path)).splitlines()[:FIRSTS]
+        return [field.strip(' "#') for line in lines for field in re.split(r"[;,\t]", line) if not is_number(field)]
+    if kind in ("parquet", "feather"):
+        with refusing(path), path.open("rb") as source:
+            if kind == "parquet":
+                return list(_module("pyarrow.parquet", path).ParquetFile(source).schema_arrow.names)
+            return list(_module("pyarrow.ipc", path).open_file(source).schema.names)
+    return []
 
 
 def _members(path: Path) -> set[str]:
@@ -143,9 +164,14 @@ def _load_feather(path: Path, columns: Columns) -> None:
 def _numbers_of(schema: Any, columns: Columns) -> list[str]:
     """Names of the fields that hold numbers or times; the others are losses."""
     numbers = [f.name for f in schema if re.match(r"u?int|float|double|halffloat|bool|timestamp|dict", str(f.type))]
-    others = [field for field in schema if field.name not in numbers]
+    words = [f.name for f in schema if re.match(r"large_string|string", str(f.type)) and _tells_apart(f.name)]
+    others = [field for field in schema if field.name not in (*numbers, *words)]
     columns.remarks.losses.extend(f"{field.name} is left out: it is of type {field.type}, no number" for field in others)
-    return numbers
+    return numbers + words
+
+
+def _tells_apart(name: str) -> bool:
+    return is_of_recordings(name) or is_of_sensors(name)
 
 
 def _add_arrow(table: Any, columns: Columns) -> None:
@@ -153,6 +179,9 @@ def _add_arrow(table: Any, columns: Columns) -> None:
         column = table.column(name)
         if str(column.type).startswith("timestamp"):
             columns.add(f"{name} [ns]", column.cast("timestamp[ns]").cast("int64").to_numpy())
+        elif "string" in str(column.type):
+            columns.labels[name] = texts = [str(text or "") for text in column.to_pylist()]
+            columns.remarks.losses.append(no_numbers(name, texts))
         else:
             columns.add(name, column.to_numpy())
 
@@ -226,7 +255,7 @@ def _load_hdf5(path: Path, columns: Columns) -> None:
         if node.external or node.is_virtual:
             raise DataError(f"{name} lies in another file", where=path, fix="Copy it into this file")
         check_size(path, node.size * 8)
-        unit = node.attrs.get("units", node.attrs.get("unit", ""))
+        unit = next((value for key, value in node.attrs.items() if key.lower() in ("unit", "units")), "")
         columns.add(name, node[()], _plain(unit))
 
     with h5py.File(path, "r") as file:

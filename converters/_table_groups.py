@@ -17,6 +17,7 @@ from ._table_times import goes_on
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 
 Axes = dict[str, str]  # columns by x, y, z
+CALIBRATED = r"(?i)\bcalibrated\b"  # in the name of a group, beside one of raw counts
 MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
 MOST_LONGER = 10.0  # is a span of time than another in the same unit
@@ -38,7 +39,7 @@ def imus_apart(columns: Columns) -> dict[str, Columns]:
     for owner, own in of.items():
         others = {group for group in groups.values() if group and group != groups[owner]}
         beside = {c for c in columns.values if group_of(c) in others and not is_time(c)}  # an orientation of theirs
-        taken = set().union(*of.values(), beside) - own
+        taken = set().union(*of.values(), beside, _raw_counts(columns)) - own
         values = {c: v for c, v in columns.values.items() if c not in taken}
         named = owner if owner[:1].isalpha() else f"imu_{owner}"  # a part of a ROS topic begins with a letter
         apart[f"/{named}/imu" if owner else IMU_TOPIC] = replace(columns, values=values)
@@ -215,10 +216,20 @@ def is_time(column: str) -> bool:
 
 
 def measured(columns: Columns) -> list[str]:
-    """Columns that may be a sensor's: no true poses, and no parameters, which are shorter."""
+    """Columns that may be a sensor's.
+
+    Poses that are true are none, nor are parameters, which are shorter, and raw counts beside what is calibrated.
+    """
     longest = max(map(len, columns.values.values()), default=0)
     long = [c for c, values in columns.values.items() if len(values) > MOST_CONSTANTS or longest <= MOST_CONSTANTS]
-    return [column for column in long if not is_true(column)]
+    counts = _raw_counts(columns)
+    return [column for column in long if not is_true(column) and column not in counts]
+
+
+def _raw_counts(columns: Columns) -> set[str]:
+    """Columns of a group `Raw` beside one `Calibrated`."""
+    calibrated = {re.sub(CALIBRATED, "raw", group_of(c)).lower() for c in columns.values if re.search(CALIBRATED, group_of(c))}
+    return {column for column in columns.values if calibrated and group_of(column).lower() in calibrated}
 
 
 def is_true(column: str) -> bool:

@@ -36,11 +36,15 @@ LEAST_NUMBERS, LEAST_LABELS = 4, 2  # in a row
 LONGEST_LINE, LONGEST_LABEL = 2_000, 80  # characters; the search for labels costs the square of their length
 NUMBER = re.compile(
     r"(?<![\w.^/])(\d{4}-\d\d-\d\d[T ]\d\d?:\d\d:\d\d(?:[.,]\d+)?Z?|\d\d?:\d\d:\d\d(?:[.,]\d+)?"
-    r"|[-+]?(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?\d++)?+)(?![\w.^])"
+    r"|[-+]?(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?\d++)?+)"
+    r"(?=(?i:[mun]?s|[cm]?m|m?g|deg|dps|k?hz|m?v|c)(?!\w)|(?![\w.^]))"  # a unit may follow without a blank
 )
 LABEL = re.compile(r"[A-Za-zµ°][^:=]*[:=]\s*[\[({'\"]*\s*$")
 SIGN = re.compile(r"[-+]\s*$")  # apart from its number
 BETWEEN = re.compile(r"[:=,;|{}\[\]()<>'\"\t]+")
+STATE = re.compile(
+    r"(?<=[:=])\s*([A-Z\d][A-Z\d_]+|(?i:true|false|yes|no|ok))(?=\s*[,;|])"
+)  # in place of a number: `GPS: NO_FIX,`
 AXIS = re.compile(r"[xyzw]", re.IGNORECASE)
 
 
@@ -166,7 +170,9 @@ def _words(line: str) -> tuple[str, ...]:
     """What stands before each number and behind the last; empty where fewer than two numbers have a label."""
     if len(line) > LONGEST_LINE:
         return ()
-    words = tuple(" ".join(text.split()) for text in NUMBER.split(line)[::2])  # numbers may be padded to a width
+    words = tuple(
+        " ".join(STATE.sub(" *", text).split()) for text in NUMBER.split(line)[::2]
+    )  # numbers may be padded to a width
     named = sum(bool(LABEL.search(text[-LONGEST_LABEL:])) for text in words[:-1])
     return words if len(words) > LEAST_NUMBERS and named >= LEAST_LABELS and not any(map(SIGN.search, words)) else ()
 

@@ -60,6 +60,8 @@ def load_json(path: Path, columns: Columns) -> None:
         if not read_rows(text, part, path):
             read_csv(text, part, path, least=1)
         if len(tables) == 1:
+            beside = name.removesuffix(name.rpartition(".")[2])  # as a rate beside the samples: `imu.frequency`, `imu.data`
+            columns.numbers = {number.removeprefix(beside): value for number, value in columns.numbers.items()}
             columns.values, columns.texts, columns.units = (
                 part.values | columns.values,
                 part.texts,

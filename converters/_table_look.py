@@ -33,7 +33,7 @@ def _start(path: Path) -> str:
     """First whole lines of a table of text; none of any other."""
     if kind_of(head(path), path) != "csv":
         return ""
-    return text_of(text_head(path) or head(path)).rpartition("\n")[0]
+    return text_of(text_head(path)).rpartition("\n")[0]
 
 
 class Seen(NamedTuple):

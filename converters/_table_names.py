@@ -41,10 +41,10 @@ CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration
 WHOLE_WORDS = "gyr|acc|time"  # that begin behind capitals
 DIGITS = str.maketrans("012", "xyz")
 WORDS = {
-    "gyro": r"gyro(scope)?|gyro_?rotation|gyroskop|gyr|gyros|gy|omega|w|(?<![pqrvc]_)wb|g|angular_?velocity|ang_?vel"
+    "gyro": r"gyro(scope)?s?|gyro_?rotation|gyroskop|gyr|gy|omega|w|(?<![pqrvc]_)wb|g|angular_?velocity|ang_?vel"
     r"|(rotation_?)?rate|rate_of_rotation|w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?|gyro_?adc|gyro_rad",
-    "accel": r"accel(eration|erometer)?|acc[el]?|ac|(?<![pr]_[a-z]{2}_)a|fb|g_?force|gf|linear_?acceleration|specific_?force"
-    r"|sp_?force|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
+    "accel": r"accel((eration|erometer)s?)?|acc[el]?|ac|(?<![pr]_[a-z]{2}_)a|fb|g_?force|gf|linear_?acceleration"
+    r"|specific_?force|sp_?force|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
 }
 STATES = r"_(raw|adc|counts?|(un)?cal(ib)?(rated)?)"  # of the numbers in a column
 STATE = rf"(?P<state>({STATES})?)"
@@ -66,6 +66,12 @@ SYMBOLS = {  # of an aircraft; specific force, or in the axes of the body, where
     "gyro": r"(?P<sensor>)(?P<axis>[pqr])",
     "accel": r"(?P<sensor>f|(.*_)?acc(el(eration)?)?_b(ody)?)_?(?P<axis>[xyz])",
 }
+NUMBERED = r"([ _-]?(id|no|nr|num(ber)?|index|idx|name|code|label))?"
+RECORDINGS = (  # columns whose values tell recordings apart
+    r"trial|run|session|recording|take|subject|subj|participant|user|person|patient|athlete|volunteer|experiment|exp|attempt"
+    r"|series|flight|source_?file|file"
+)
+SENSORS = r"sensor|device|imu|node|placement|body_?(part|segment|location)|limb|(sensor|device|imu)_?(position|location)"
 CHINESE = {"加速度": "acc_", "角速度": "gyro_", "时间": "time"}  # of WitMotion's program
 AXES = {"0": "x", "1": "y", "2": "z"}
 TURNS = AXES | {"roll": "x", "pitch": "y", "yaw": "z", "p": "x", "q": "y", "r": "z"}
@@ -94,6 +100,18 @@ def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[st
     owners = [re.sub(rf"(^|_)({WORDS[sensor]})$", "", name) for name, _ in whole]
     named = owners if len({*owners}) == len(whole) else [name + state for name, state in whole]
     return dict(zip(named, whole.values(), strict=True))
+
+
+def is_of_recordings(column: str) -> bool:
+    """Whether a column is named as one that tells recordings apart: `trial`, `Subject ID`."""
+    return re.fullmatch(rf"(({RECORDINGS}){NUMBERED}|id)", spaced_name(column)) is not None
+
+
+def is_of_sensors(column: str) -> bool:
+    """Whether a column is named as one that tells sensors apart: `device_id`, `placement`."""
+    return (
+        re.fullmatch(rf"(({SENSORS})|(sensor|device|imu)_({SENSORS})){NUMBERED}|mac|address", spaced_name(column)) is not None
+    )
 
 
 def name_and_unit(column: str, beside: str) -> tuple[str, str]:

@@ -12,14 +12,15 @@ DECIMAL_COMMA = re.compile(r"[+-]?(0?,\d+|\d+,(\d\d?|\d{4,}))([eE][+-]?\d+)?")  
 WHOLE_NUMBER = re.compile(r"[+-]?\d{1,19}")
 SAMPLED = 200  # rows that show which columns are whole numbers
 EXACT = 2.0**15  # larger numbers that are not whole keep their texts: seconds since 1970 and days lose nanoseconds as float64
+MOST_BACK = 0.25  # share of the steps of a time that go back
 MOST_ODD = 0.1  # share of the fields of a column of numbers that are none: `-`, `ERR`, a garbled line
 
 
 def plain_columns(lines: list[str], delimiter: str | None) -> tuple[list[np.ndarray | None], list[list[str]]] | None:
     """Numbers and texts of columns, of lines of equally many fields; None of other lines.
 
-    A field may have quotes, with no delimiter in them. A column is all of numbers, and has its texts only where float64 rounds
-    them, or is all of texts. NumPy takes a tenth of the time and memory of Python's fields.
+    A field may have quotes, with no delimiter in them. A column is all of numbers, and has its texts only if it may be a time
+    that float64 rounds, or is all of texts. NumPy takes a tenth of the time and memory of Python's fields.
     """
     if any('"' in line for line in lines):
         if any(_count(part, delimiter) > 1 for line in lines for part in line.split('"')[1::2]):
@@ -44,11 +45,17 @@ def plain_columns(lines: list[str], delimiter: str | None) -> tuple[list[np.ndar
         return None
     values = [np.ascontiguousarray(rows[str(k)]) if str(k) in kinds else None for k in range(width)]
     texts: list[list[str]] = [[] for _ in values]
-    kept = [k for k, c in enumerate(values) if c is None or (c.dtype.kind == "f" and bool((np.abs(c) > EXACT).any()))]
-    for parts in (line.split(delimiter) for line in lines if kept):
+    kept = [k for k, column in enumerate(values) if column is None or _is_rounded_time(column)]
+    for parts in (line.split(delimiter, max(kept) + 1) for line in lines if kept):
         for k in kept:
             texts[k].append(parts[k].strip())
     return values, texts
+
+
+def _is_rounded_time(column: np.ndarray) -> bool:
+    """Whether a column may be a time that float64 rounds; it seldom goes back."""
+    is_large = column.dtype.kind == "f" and bool((np.abs(column) > EXACT).any())
+    return is_large and bool((np.diff(column) < 0.0).sum() <= MOST_BACK * len(column))
 
 
 def _count(line: str, delimiter: str | None) -> int:

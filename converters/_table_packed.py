@@ -24,6 +24,8 @@ from ._source import head
 TABLES = ".csv", ".txt", ".tsv", ".dat"
 ENDINGS = ".gz", ".xz", ".bz2", ".zst", ".zip"
 LIMIT = 4 << 30  # bytes of a table
+FEW_LINES, LONG_HEAD = 4, 1 << 18  # a header of hundreds of columns and a row of them are longer than the first bytes
+UTF16 = b"\xff\xfe", b"\xfe\xff"
 ZSTD = b"\x28\xb5\x2f\xfd"
 ZSTD_STEP = 1 << 10  # packed bytes: a block of four bytes can unpack to 128 KiB
 FOREIGN = lzma.LZMAError, zstandard.ZstdError  # errors of damaged bytes that are no OSError
@@ -63,13 +65,21 @@ def table_name(path: Path) -> str:
 
 
 def text_head(path: Path) -> bytes:
-    """First bytes of a packed text.
+    """First bytes of a text, unpacked; of one with long lines so many that they hold several.
 
     None of one that cannot be unpacked.
     """
+    start = _first(path, HEAD)
+    is_text = start.startswith(UTF16) or b"\0" not in start
+    return _first(path, LONG_HEAD) if is_text and len(start) == HEAD and start.count(b"\n") < FEW_LINES else start
+
+
+def _first(path: Path, size: int) -> bytes:
+    if opener(head(path)) is None:
+        return head(path, size)
     try:
         with _opened(path) as file:
-            return bytes(file.read(HEAD))
+            return bytes(file.read(size))
     except DataError:
         return b""
 

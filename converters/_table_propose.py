@@ -36,6 +36,7 @@ from ._table_units import (
 
 RANGES = 250, 500, 1000, 2000  # deg/s, of InvenSense's gyros
 NEAR_FEET = 0.05  # share by which an acceleration may differ from gravity in ft/s^2, as one of 3.3 g in m/s^2 does
+LEAST_COUNTS = 50.0  # of gravity in whole numbers
 MOST_SHOWN = 12  # triples of columns in a message
 NOTHING: Entries = {}
 
@@ -161,6 +162,8 @@ def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:
     """Unit from the magnitude: gravity shows that of an accelerometer; no magnitude shows that of a gyro."""
     if sensor == "accel":
         level, near = gravity_units(columns, proposal.unsigned(sensor, columns))
+        is_coarse = level < LEAST_COUNTS and _are_whole(columns.side_by_side(proposal.unsigned(sensor, columns)))
+        near = [] if is_coarse else near  # whole m/s^2 are counts of something else
         if len(near) == 1:
             proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {near[0]}")
             proposal.entries["accel_unit"] = near[0]
@@ -189,6 +192,11 @@ def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:
             ]
     proposal.open.append(f"{sensor}_unit")
     proposal.reasons.append(NO_UNIT.format(sensor))
+
+
+def _are_whole(values: np.ndarray) -> bool:
+    """Whether all numbers are whole."""
+    return not (values[np.isfinite(values)] % 1.0).any()
 
 
 def _propose_increments(proposal: Proposal, columns: Columns) -> None:

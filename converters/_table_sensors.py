@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ._table_headerless import name_headerless
-from ._table_names import UNITS, split_name
+from ._table_names import UNITS, is_of_recordings, split_name
 from ._table_numbers import is_number
 from ._table_text import COMMENTS, Columns, read_csv
 from ._table_times import rises
@@ -134,6 +134,8 @@ def _rows_of_kinds(start: str) -> tuple[str, int, dict[str, str]] | None:
     """
     mark, rows = _split_rows(start)
     header = rows.pop(0) if rows and not any(map(is_number, rows[0])) else []
+    if any(is_of_recordings(name) and not re.fullmatch(DEVICE, name.strip()) for name in header):
+        return None  # whose devices are told apart in each recording
     behind = [place for place, name in enumerate(header) if place >= PLACES and re.fullmatch(DEVICE, name.strip())]
     for place in [*range(PLACES), *behind]:
         long = [row for row in rows if len(row) > place]

@@ -20,6 +20,7 @@ from imutool.recording.message_log import Remarks
 
 from ._table_dates import calendar_times, damaged_times, join_dates
 from ._table_header import header_of, note_unused_header
+from ._table_names import is_of_recordings, is_of_sensors
 from ._table_numbers import (
     COMMA_NUMBER,
     DECIMAL_COMMA,
@@ -31,8 +32,8 @@ from ._table_numbers import (
     vector,
     vectors,
 )
+from ._table_packed import UTF16
 
-UTF16 = b"\xff\xfe", b"\xfe\xff"
 WIDEST = 64  # columns of a matrix; wider ones are images
 MAX_LINE = 65_536
 LEAST_NUMBERS = 4  # in a row: a time and a vector
@@ -58,6 +59,7 @@ class Columns:
     units: dict[str, str] = field(default_factory=dict)
     numbers: dict[str, float] = field(default_factory=dict)
     texts: dict[str, list[str]] = field(default_factory=dict)
+    labels: dict[str, list[str]] = field(default_factory=dict)  # texts of columns that tell recordings or sensors apart
     remarks: Remarks = field(default_factory=Remarks)
     sources: dict[str, str] = field(default_factory=dict)
     has_structures: bool = False  # whose fields follow a dot, which in the name of a plain table's column makes no group
@@ -228,8 +230,14 @@ def _add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> Non
             f"{name} is left out: {len(damaged)} of its fields are no times as {usual!r} is ({first})"
         )
     else:
-        wrong = next((text for text in texts if text and not is_number(text)), texts[0])
-        columns.remarks.losses.append(f"{name} is left out: its fields, as {wrong[:40]!r}, are no numbers")
+        columns.labels |= {name: texts} if is_of_recordings(name) or is_of_sensors(name) else {}
+        columns.remarks.losses.append(no_numbers(name, texts))
+
+
+def no_numbers(name: str, texts: list[str]) -> str:
+    """Sentence on a column of texts, which is left out."""
+    wrong = next((text for text in texts if text and not is_number(text)), texts[0])
+    return f"{name} is left out: its fields, as {wrong[:40]!r}, are no numbers"
 
 
 def _width(rows: list[list[str]], above: list[list[str]]) -> int:

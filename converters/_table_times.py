@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Int64
 from imutool.errors import ConfigError
 from imutool.recording.message_log import MessageLog
 
@@ -37,6 +37,8 @@ DAY_NS = 86_400 * NS
 SERIAL_DAYS = {"Excel": 25_569, "MATLAB": 719_529}  # days of their calendars at the start of 1970
 FIRST_DAY, LAST_DAY = 10_957, 47_482  # of 2000 and of 2100, since 1970
 WORD_SIZES = 2**8, 2**16, 2**32  # at which a counter begins again
+SIZES = *(2**k for k in range(4, 33)), *(10**k for k in range(10)), 24, 60, 3600, 86_400  # at which a time or a counter does
+LEAST_ROWS = 20  # of a recording, in the mean
 
 
 def join_gps_weeks(columns: Columns) -> None:
@@ -169,6 +171,27 @@ def counts_others(values: np.ndarray) -> bool:
     return float(np.mean(steps % max(float(np.median(steps)), 1.0) != 0.0)) > MOST_ODD
 
 
+def is_counter(name: str) -> bool:
+    """Whether a column is named as one that counts samples."""
+    return re.search(COUNTER, name, re.IGNORECASE) is not None
+
+
+def begun_anew(values: np.ndarray) -> Int64[np.ndarray, " k"]:
+    """Rows in which a time or a counter begins anew, as in a table of several recordings.
+
+    None where it begins anew at a power of two, or as the seconds of a minute and the fractions of a second do.
+    """
+    steps = np.diff(values.astype(np.float64))
+    rows = np.flatnonzero(steps < 0.0) + 1
+    if not len(rows) or len(values) < LEAST_ROWS * (len(rows) + 1) or np.mean(steps > 0.0) < 0.5:
+        return np.zeros(0, np.int64)
+    step, last = float(np.median(steps[steps > 0.0])), values[rows - 1].astype(np.float64)
+    size = min(SIZES, key=lambda each: abs(float(last.max()) + step - each))
+    passed = last - values[np.concatenate([[0], rows[:-1]])]
+    is_wrap = abs(float(last.max()) + step - size) <= step and (last > size - MOST_SKIPPED * size).all()
+    return rows if not is_wrap and (-steps[rows - 1] > passed / 2.0).all() else np.zeros(0, np.int64)
+
+
 def said_steps(values: np.ndarray) -> str:
     """Shares of the most frequent steps of a counter, in words."""
     steps, counts = np.unique(np.diff(_unwrapped(values)), return_counts=True)
@@ -201,6 +224,9 @@ def count_times(columns: Columns, rate_hz: float, length: int, counter: str) -> 
         )
     else:
         counts = _unwrapped(values)
+        if len(rows := begun_anew(values)):
+            what = f"{counter!r} begins anew in row {rows[0] + 1}, and at no power of two"
+            raise ConfigError(what, where="counter", expected="the samples of one recording")
         counts /= max(float(np.median(np.diff(counts))), 1.0)  # a packet's number also counts those of other sensors
     name = f"{COUNTED}{counter or length}"
     columns.values[name], columns.units[name] = counts / rate_hz, "s"

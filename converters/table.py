@@ -44,6 +44,7 @@ from ._table_map import (
 )
 from ._table_motion import settle_accel_unit
 from ._table_packed import table_name
+from ._table_parts import load_table, recordings_in, refuse_joined
 from ._table_pose_names import why_no_poses
 from ._table_propose import propose
 from ._table_rotations import TURNS, known_rotations, of_angles, of_matrices, unit_by_poses
@@ -69,9 +70,9 @@ def sequences(source: Path) -> list[Sequence]:
 
 
 def _recordings(found: Sequence) -> list[Sequence]:
-    """The table, or the sheets of a spreadsheet that are recordings of their own."""
+    """The table, or the recordings that its sheets or its columns tell apart."""
     is_sheets = found.path.is_file() and kind_of(head(found.path), found.path) == "sheets"
-    return recordings(found, read_text) if is_sheets else [found]
+    return recordings(found, read_text) if is_sheets else recordings_in(found)
 
 
 def recognises(sequence: Sequence) -> bool:
@@ -87,11 +88,13 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
         DataError: the file cannot be read.
     """
     path = sequence.path
-    columns = load_split(path, sequence.inside) if path.is_dir() else load(path, kind_of(head(path), path), sequence.inside)
+    columns = load_split(path, sequence.inside) if path.is_dir() else load_table(path, sequence.inside)
     remarks, place = columns.remarks, mapping if isinstance(mapping, Path) else path
     given = {} if mapping is None else within_groups(read_map(mapping), columns)
     tables = _mapped(columns, given, place) or _proposed(columns, path / sequence.inside, remarks, given)
     tables = [_clocked(columns, table, place) for table in tables]
+    for each in (each for each in tables if each.rate_hz):
+        refuse_joined(columns, columns.unsigned(each.gyro[0]), place)
     table = tables[0]  # other columns are on its clock
     imus = {each.topic: _imu(columns, each, place) for each in tables}
     used = {c for each in tables for c in (each.time, each.counter, each.accel_time, *each.gyro, *each.accel)}

@@ -23,6 +23,7 @@ GAP_NS = nanoseconds(0.5)  # no longer step says anything of the period
 GAP_BATCHES = 1.7  # batches: samples are missing in a longer step, which ends a stretch, as one back does
 SHORT, MANY_SHORT = 0.7, 0.05  # of the median step, and the share of such steps that only late stamps leave
 SPAN = 16  # samples: over so many, stamps that jitter by a period show the period, and one of them is hardly late
+AHEAD = 64  # samples, within which those that a program held back are all there
 STAYS = 0.5  # of a period: by which the stamps behind a step are later at least, where a sample is lost and not late
 WRAPS = {
     f"{bits} bit of {unit}": 2**bits * ns for bits in (16, 32) for unit, ns in (("ns", 1), ("us", 1000), ("ms", 1_000_000))
@@ -140,6 +141,23 @@ def stay_late(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Bool[np.nd
     return late
 
 
+def lost_samples(stamp_ns: Int64[np.ndarray, " n"], period_ns: float, steps: Bool[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
+    """Number of samples lost in each of `steps` behind which the stamps stay late.
+
+    Each is counted once. The earliest stamps on both sides show how many are lost. What is later than these is late, not lost.
+    """
+    lost, last = np.zeros(len(steps), np.int64), -1
+    for row in np.flatnonzero(steps & stay_late(stamp_ns, period_ns)).tolist():
+        first, behind = max(last + 1, row - SPAN + 1), row + 1
+        held_back = int((np.diff(stamp_ns[row : behind + AHEAD]) < BUNCHED * period_ns).sum()) > SPAN // 2
+        near = stamp_ns[first : behind + (AHEAD if held_back else SPAN)]  # over more samples a rate that wanders hides losses
+        line = (near - near[0]) - period_ns * np.arange(len(near))
+        late_ns = line[behind - first :].min() - line[: behind - first].min()
+        lost[row] = max(0, round(float(late_ns) / period_ns))
+        last = row if lost[row] else last
+    return lost
+
+
 def _fraction_unit(stamp_ns: Int64[np.ndarray, " n"]) -> int:
     """Unit of the stamps' fractions of a second in ns: not 1 where a driver wrote them in another unit.
 
@@ -202,8 +220,7 @@ def _lost(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Bool[np.ndarra
     late, is_long = stay_late(stamp_ns, period_ns), np.diff(stamp_ns) > GAP_BATCHES * period_ns
     begins = late & ~np.concatenate([late[:1], late[:-1]])
     begins[:SPAN] = begins[-SPAN:] = False  # where few stamps show it
-    lost: Bool[np.ndarray, " m"] = begins | (late & is_long)
-    return lost
+    return lost_samples(stamp_ns, period_ns, begins | (late & is_long)) > 0
 
 
 def _at_one_rate(stamp_ns: Int64[np.ndarray, " n"], batch: float) -> Iterator[tuple[int, int]]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -127,13 +126,6 @@ def show(survey: Survey) -> None:
 REPAIRED = Written((".mcap", ".bag"))
 
 
-class Damaged(StrEnum):
-    """Treatment of damaged bytes."""
-
-    drop = "drop"
-    keep = "keep"
-
-
 class Repair(Report, frozen=True, kw_only=True, tag="imutool.repair/1"):
     """Report of `imutool repair`; `kept` counts damaged stretches kept as attachments (MCAP)."""
 
@@ -151,7 +143,9 @@ class Repair(Report, frozen=True, kw_only=True, tag="imutool.repair/1"):
 def repair(
     source: Annotated[str, typer.Argument(metavar="IN", help="A damaged MCAP log or ROS 1 bag: a file or a URL.")],
     target: Annotated[str, typer.Argument(metavar="OUT", help="New log with all intact messages."), REPAIRED],
-    damaged: Annotated[Damaged, typer.Option(help="Drop damaged bytes, or keep them as attachments (MCAP).")] = Damaged.drop,
+    damaged: Annotated[
+        Literal["drop", "keep"], typer.Option(help="Drop damaged bytes, or keep them as attachments (MCAP).")
+    ] = "drop",
     max_chunk: MaxChunk = None,
     common: Common = COMMON,
 ) -> None:
@@ -166,7 +160,7 @@ def repair(
         repaired = run(
             source,
             target,
-            damaged=damaged.value,
+            damaged=damaged,
             max_chunk=max_chunk,
             overwrite=common.overwrite,
             progress=lambda done, total: tell(done, total, ""),

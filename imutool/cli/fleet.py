@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -128,12 +128,10 @@ def debias(
 @_command("repair logs/ repaired/ --report repaired.html")
 def repair(
     damaged: Annotated[
-        str, typer.Option(metavar="drop|keep", help="Drop damaged bytes, or keep them as attachments (MCAP).")
+        Literal["drop", "keep"], typer.Option(help="Drop damaged bytes, or keep them as attachments (MCAP).")
     ] = "drop",
 ) -> Settings:
     """Repair every log and ROS 1 bag, as `imutool repair` does; copy intact ones."""
-    if damaged not in {"drop", "keep"}:
-        raise ConfigError(f"unknown value {damaged!r}", where="damaged", expected="drop or keep")
     return Settings(command="repair", damaged=damaged)
 
 

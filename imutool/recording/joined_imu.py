@@ -222,7 +222,8 @@ def lost_to_set_back(t_ns: Int64[np.ndarray, " n"], name: str) -> list[str]:
     if lost <= MOST_SET_BACK * len(t_ns) or all(step_s > 0.0 for _, step_s in clock_jumps(t_ns)):
         return []
     what = f"{name}: {lost} of {len(t_ns)} samples are left out, as their time goes back to that of samples before them"
-    return [f"{what}; if the table holds several recordings, give each a table of its own"]
+    fix = "give each a table of its own, or add a column `trial` that tells them apart"
+    return [f"{what}; if the table holds several recordings, {fix}"]
 
 
 def joined(

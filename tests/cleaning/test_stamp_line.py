@@ -68,8 +68,27 @@ def test_stamps_that_are_late_by_up_to_a_period_are_led_back_and_lost_samples_st
     off = np.abs(restamped(stamps) - true)
     assert np.quantile(off, 0.999) < (0.6e6 if late_ns else 1000)
     assert off.max() <= late_ns + 6000  # beside a lost sample that late stamps hide
-    count = missing(stamps, usual_period(stamps)).sum()
-    assert len(lost) <= count <= (2 * len(lost) if late_ns > 1_000_000 else len(lost))  # late ones beside a lost one count
+    assert missing(stamps, usual_period(stamps)).sum() == len(lost)  # late ones beside a lost one do not count
+
+
+@pytest.mark.parametrize("periods", [1.5, 3.0, 6.0])
+def test_a_late_stamp_behind_a_lost_sample_is_no_further_loss(periods: float) -> None:
+    true = np.delete(sampled(), LOST)
+    late = true.copy()
+    late[np.array(LOST) - np.arange(len(LOST))] += round(periods * PERIOD_NS)  # those behind the lost ones
+    stamps = np.sort(late)
+    assert missing(stamps, usual_period(stamps)).sum() == len(LOST)
+    assert missing(restamped(stamps), usual_period(stamps)).sum() == len(LOST)
+
+
+@pytest.mark.parametrize("dropped", [0, 5])
+@pytest.mark.parametrize("held_back", [8, 20])
+def test_samples_that_a_program_held_back_are_late_and_only_those_it_dropped_are_lost(held_back: int, dropped: int) -> None:
+    late, starts = sampled(), range(1000, 11_000, 1000)
+    for start in starts:
+        late[start : start + held_back] = late[start + held_back]
+    stamps = np.delete(late, [start + n for start in starts for n in range(dropped)])
+    assert missing(stamps, usual_period(stamps)).sum() == dropped * len(starts)
 
 
 def test_many_lost_samples_are_counted_though_they_make_long_steps() -> None:

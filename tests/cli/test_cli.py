@@ -246,6 +246,13 @@ def test_an_output_that_knows_few_letters_gets_a_report_and_json_stays_utf_8(
     assert json.loads(said.decode("utf-8"))["log"] == log.stem
 
 
+@pytest.mark.parametrize("words", [("repair",), ("fleet", "repair")])
+def test_an_unknown_word_for_damaged_bytes_is_a_usage_error(imutool: Run, tmp_path: Path, words: tuple[str, ...]) -> None:
+    done = imutool(*words, "a.mcap", "out", "--damaged", "mend", cwd=tmp_path)
+    assert done.returncode == errors.UsageError.exit_code
+    assert "'mend' is not one of 'drop', 'keep'" in " ".join(done.stderr.replace("│", " ").split())
+
+
 def test_a_usage_error_says_how_to_give_many_logs_and_a_name_that_begins_with_a_dash(imutool: Run, tmp_path: Path) -> None:
     done = imutool("debias", "a.mcap", "b.mcap", "c.mcap", cwd=tmp_path)
     assert done.returncode == errors.UsageError.exit_code

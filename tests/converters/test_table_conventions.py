@@ -606,3 +606,19 @@ def test_an_array_of_six_columns_beside_named_sensors_is_no_imu(tmp_path):
     (sequence,) = table.sequences(tmp_path / "log.npz")
     imu = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"}).imus["/imu0"]
     np.testing.assert_allclose(imu.gyro, 2.0 * GYRO)
+
+
+def test_raw_counts_beside_calibrated_samples_are_no_imu(tmp_path):
+    """APDM's older HDF5 files have both for each monitor, and names in the plural."""
+    with h5py.File(tmp_path / "opal.h5", "w") as file:
+        for monitor in ("SI-1", "SI-2"):
+            group = file.create_group(monitor)
+            group["Time"] = (1_700_000_000_000_000 + 10_000 * np.arange(200)).astype(np.uint64)
+            for name, level, unit in (("Gyroscopes", 0.1, "rad/s"), ("Accelerometers", 9.81, "m/s^2")):
+                values = group.create_dataset(f"Calibrated/{name}", data=np.tile([0.0, 0.0, level], (200, 1)))
+                values.attrs["Units"] = np.bytes_(unit)
+                group.create_dataset(f"Raw/{name}", data=np.tile([0, 0, round(1000 * level)], (200, 1)))
+    (found,) = table.sequences(tmp_path / "opal.h5")
+    log = table.read_sequence(found)
+    assert [*log.imus] == ["/si_1_calibrated/imu", "/si_2_calibrated/imu"]
+    assert {tuple(imu.gyro[0]) for imu in log.imus.values()} == {(0.0, 0.0, 0.1)}

@@ -167,3 +167,12 @@ def test_lines_of_several_devices_are_several_imus(tmp_path, devices):
 def test_objects_behind_one_another_are_rows(tmp_path, indent):
     imu = read(tmp_path / "stream.txt", "".join(json.dumps(row, indent=indent) for row in FLAT)).imus["/imu0"]
     assert np.array_equal(imu.gyro, GYRO)
+
+
+def test_a_rate_beside_the_samples_of_one_sensor_is_theirs(tmp_path):
+    """Another sensor has its own."""
+    samples = [{"gyroscope": g, "acceleration": a} for _, g, a in SAMPLES]
+    document = {"emg": {"frequency": 200, "data": [[1, 2]] * COUNT}, "imu": {"frequency": 50, "data": samples}}
+    (tmp_path / "log.json").write_text(json.dumps(document))
+    log = table.read_sequence(table.sequences(tmp_path / "log.json")[0], mapping={"gyro_unit": "rad/s"})
+    assert log.imus["/imu0"].t_ns.tolist() == [n * 20_000_000 for n in range(COUNT)]

@@ -491,3 +491,12 @@ def test_a_time_in_the_last_column_is_one_by_its_century(tmp_path):
     path.write_text(path.read_text().split("\n", 1)[1])
     with pytest.raises(ConfigError, match="'column 9' alone rises as a time since 1970 does: it counts as the time"):
         read(path)
+
+
+def test_texts_of_large_numbers_are_kept_for_what_may_be_a_time_alone():
+    """Texts of every column took most of the time and memory of wide tables."""
+    t = [f"17000000{row // 10}.{row % 10}00000001" for row in range(100, 400)]
+    forces = np.random.default_rng(3).normal(0.0, 1e5, 300)
+    columns = plain_columns([f"{a},{b:.4f}" for a, b in zip(t, forces, strict=True)], ",")
+    assert columns is not None
+    assert columns[1] == [t, []]

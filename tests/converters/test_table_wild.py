@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -559,3 +560,43 @@ def test_commas_behind_a_header_and_its_rows_hide_no_name(tmp_path):
     path = write_csv(tmp_path / "imu.csv", NAMES, [T_S, *ACCEL_G.T, *(COUNTS * 0.07).round(2).T])
     path.write_text("".join(f"{line},,,\n" for line in path.read_text().splitlines()))
     assert len(read(path).imus["/imu0"]) == COUNT
+
+
+@pytest.mark.parametrize("is_packed", [False, True])
+@pytest.mark.parametrize("is_in_folder", [False, True])
+def test_a_table_of_hundreds_of_columns_is_one(tmp_path, is_packed, is_in_folder):
+    """Its header and first row are longer than what shows most tables."""
+    joints = [f"joint_{number}_angle (deg)" for number in range(400)]
+    names = ["time (s)", *(f"gyro_{a} (rad/s)" for a in "xyz"), *(f"acc_{a} (g)" for a in "xyz"), *joints]
+    values = [T_S, *(0.01 * COUNTS).T, *ACCEL_G.T, *np.round(RNG.normal(0.0, 30.0, (400, COUNT)), 4)]
+    path = write_csv(tmp_path / "imu.csv", names, values)
+    if is_packed:
+        (tmp_path / "imu.csv.gz").write_bytes(gzip.compress(path.read_bytes()))
+        path.unlink()
+    log = read(tmp_path if is_in_folder else next(tmp_path.iterdir()))
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, 0.01 * COUNTS)
+
+
+def test_units_and_states_behind_the_names_of_numbers_are_no_names(tmp_path):
+    """`16555014.81m` is a number with its unit, and `GPS: NO_FIX` holds no number: both may change from row to row."""
+    form = (
+        "2025-10-04 16:35:{:06.3f},EULER(deg): R=1.70,P=9.24,GYRO: X={:.4f},Y={:.4f},Z={:.4f},"
+        "ACCEL: X={:.4f},Y={:.4f},Z={:.4f},ALT: {:.2f}m,GPS: {},SAT=4,iTOW={}ms"
+    )
+    rows = [
+        form.format(0.1 * n, *(0.01 * COUNTS[n]), *(9.8 * ACCEL_G[n]), 100.0 + n, ("NO_FIX", "3D_FIX")[n % 2], 200 * n)
+        for n in range(COUNT)
+    ]
+    (tmp_path / "log.txt").write_text("\n".join(rows) + "\n")
+    (found,) = table.sequences(tmp_path / "log.txt")
+    log = table.read_sequence(found, mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, 0.01 * COUNTS, atol=1e-9)
+    assert not log.remarks.losses
+    assert log.scalars["/ALT_m"].unit == "m"
+
+
+def test_a_few_whole_numbers_are_no_gravity(tmp_path):
+    """Counts of an acceleration without gravity may have a median of 10."""
+    counts = np.round(RNG.normal([0.0, -10.0, -4.0], 1.0, (COUNT, 3)))
+    with pytest.raises(ConfigError, match="state no unit of the accel that imutool knows, and its values show none"):
+        read(write_csv(tmp_path / "imu.csv", NAMES, [T_S, *counts.T, *(COUNTS / 16).T]))

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Int64
 from imutool.cleaning.finding import MAX_INTERVALS, Finding
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
-from imutool.cleaning.stamp_line import batch_size, batch_words, bunched, stay_late, usual_period
+from imutool.cleaning.stamp_line import batch_size, batch_words, bunched, lost_samples, usual_period
 from imutool.recording import nanoseconds
 from imutool.recording.columns import MOST_GAP_S
 
@@ -115,15 +115,13 @@ class Gaps(Rule):
         return gap._replace(missing=max(gap.missing - late, 0))
 
 
-def missing(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Float64[np.ndarray, " m"]:
-    """Number of samples that would fill each step.
+def missing(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Int64[np.ndarray, " m"]:
+    """Number of samples that are lost in each step.
 
     0 for steps below 1.5 periods, for pauses, and where a stamp is late that those behind it make up for.
     """
     steps_ns = np.diff(stamp_ns)
-    periods = steps_ns / period_ns
-    is_lost = (periods >= MISSING_STEP) & (steps_ns <= PAUSE_NS) & stay_late(stamp_ns, period_ns)
-    return np.where(is_lost, np.round(periods - 1.0), 0.0)
+    return lost_samples(stamp_ns, period_ns, (steps_ns >= MISSING_STEP * period_ns) & (steps_ns <= PAUSE_NS))
 
 
 def pause_words(steps_ns: Int64[np.ndarray, " n"]) -> list[str]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, NamedTuple
 
@@ -34,6 +34,19 @@ POSITION = r"position|pos|translation|p"
 ORIENTATION = r"orientation|rotation|quaternion|quat|attitude|q"
 POSE_TYPES = r"pose(?!s)|odom|truth|mocap|vicon|tracker"  # in the name of a type or topic: clouds and grids have poses too
 FRAME = r"frame_?id|frame"
+PER_S = r"[ _]?(/|\bper\b) ?s(ec(ond)?s?)?\b"
+STATED = {  # units in the comments of a definition, with their size in SI
+    "gyro": {
+        rf"\b(m|milli)(dps\b|deg(ree)?s?{PER_S})": np.pi / 180e3,
+        rf"(?<![a-z])(dps\b|deg(ree)?s?{PER_S})|°/s": np.pi / 180.0,
+        rf"\brad(ian)?s?{PER_S}|\brps\b": 1.0,
+    },
+    "accel": {
+        r"m/s(\^|\*\*)?2|m/s²|m/s/s|\bmet(er|re)s? per sec(ond)?s?( squared|\^2|²)|\bmps2\b": 1.0,
+        r"\b(mg|milli-?g'?s?)\b": 9.80665e-3,
+        r"[\[(](in )?g'?s?[\])]|\bin g'?s?\b|^g'?s?$|\bunits?:? g\b": 9.80665,
+    },
+}
 LOG_TIME, WITHOUT_STAMP = "log time", "as the messages state no stamp with its unit"
 
 
@@ -56,6 +69,7 @@ class Reflected:
     frame: Path | None
     covariances: tuple[Path | None, ...] = ()
     other_stamps: tuple[Path, ...] = ()  # further times in the message, which do not count
+    sizes: tuple[float, float] = (1.0, 1.0)  # of the rates and the accelerations of an IMU in SI, as the definition states
 
     def sample(self, raw: bytes, log_time: int) -> Sample:
         """Sample in a message; at its log time where it has no stamp.
@@ -67,7 +81,10 @@ class Reflected:
             message, at = self.format.parse(raw), self.format.at
             stamp_ns = sum(int(at(message, path)) * size for path, size in self.stamp)
             frame = "" if self.frame is None else str(at(message, self.frame))
-            return Sample(stamp_ns or log_time, frame, [float(at(message, path)) for path in self.vectors])
+            values = [float(at(message, path)) for path in self.vectors]
+            if self.sizes != (1.0, 1.0):
+                values = [self.sizes[n // 3] * value for n, value in enumerate(values)]
+            return Sample(stamp_ns or log_time, frame, values)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"the message lacks {error}") from error
 
@@ -86,7 +103,8 @@ class Reflected:
             ValueError: the bytes are no such message.
         """
         values = np.array(self.sample(raw, 0).values).reshape(2, 3)
-        return self._patched(raw, zip(self.vectors, (matrices @ values[:, :, None]).ravel().tolist(), strict=True))
+        recorded = (matrices @ values[:, :, None])[:, :, 0] / np.array(self.sizes)[:, None]
+        return self._patched(raw, zip(self.vectors, recorded.ravel().tolist(), strict=True))
 
     def _patched(self, raw: bytes, fields: Iterable[tuple[Path, float]]) -> bytes:
         """Message in CDR with other numbers, written in place."""
@@ -205,7 +223,19 @@ def reflect_cdr(schema_name: str, schema: bytes) -> Reflected | None:
         form = ros2_definition.DescribedCdr(ros2_definition.parse(schema_name, schema))
     except LogError:
         return None
-    return _found(form.tree(DEPTH), form)
+    found = _found(form.tree(DEPTH), form)
+    if found is None:
+        return None
+    first = (form.comments(found.vectors[0]), STATED["gyro"]), (form.comments(found.vectors[3]), STATED["accel"])
+    gyro, accel = (_stated(comments, units) for comments, units in first)
+    return replace(found, sizes=(gyro, accel))
+
+
+def _stated(comments: Iterable[str], units: Mapping[str, float]) -> float:
+    """Size of the unit that the nearest comment states; 1 where none states one, or one states several."""
+    named = ([size for unit, size in units.items() if re.search(unit, text.lower())] for text in comments)
+    nearest = next(filter(None, named), [1.0])
+    return nearest[0] if len(nearest) == 1 else 1.0
 
 
 def _found(tree: Tree, form: Format) -> Reflected | None:

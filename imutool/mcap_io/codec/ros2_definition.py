@@ -45,11 +45,15 @@ Message = tuple[bytes, Mapping[str, tuple[int, str]]]  # bytes; first byte and f
 
 
 class Field(NamedTuple):
-    """One line of a definition; `length` is None for one value, 0 for a sequence."""
+    """One line of a definition; `length` is None for one value, 0 for a sequence.
+
+    `comment` stands behind it, or else above it and the fields before it, without a blank line between them.
+    """
 
     name: str
     kind: str
     length: int | None
+    comment: str = ""
 
 
 class Leaf(NamedTuple):
@@ -92,9 +96,11 @@ def _short(name: str) -> str:
 
 
 def _fields(of: str, body: str) -> Iterator[Field]:
+    above = ""
     for line in body.splitlines():
-        bare = line.partition("#")[0].strip()
+        bare, _, comment = (part.strip() for part in line.partition("#"))
         if not bare:
+            above = comment
             continue
         found = _FIELD.fullmatch(bare)
         if found is None:
@@ -105,7 +111,7 @@ def _fields(of: str, body: str) -> Iterator[Field]:
         if kind not in NUMBERS and kind not in (TEXT, "wstring", *TIMES):
             kind = _short(kind) if "/" in kind else "std_msgs/Header" if kind == "Header" else f"{of.partition('/')[0]}/{kind}"
         count = None if found["array"] is None else 0 if found["bound"] else int((found["count"] or "0")[:12])
-        yield Field(found["name"], kind, count)
+        yield Field(found["name"], kind, count, comment or above)
 
 
 def _check(name: str, known: Definition, sound: dict[str, int], depth: int) -> int:
@@ -220,6 +226,15 @@ class DescribedCdr:
             elif field.kind in self._definition and field.length is None and depth:
                 fields[field.name] = self._tree(field.kind, depth - 1, left)
         return fields
+
+    def comments(self, path: Sequence[str | int]) -> Iterator[str]:
+        """Comments of a field and of those around it, the nearest first."""
+        kind, found = self._definition[""][0].kind, list[str]()
+        for key in (key for key in path if isinstance(key, str)):
+            field = next(field for field in self._definition[kind] if field.name == key)
+            kind = field.kind
+            found.append(field.comment)
+        yield from reversed(found)
 
     def parse(self, raw: bytes) -> Message:
         """Message with the places of its numbers.

@@ -1,0 +1,166 @@
+"""Several recordings, or several sensors, in one table: by a column that tells them apart, or by a time that begins anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+from support.tables import write_csv
+
+from imutool.converters import table
+from imutool.errors import ConfigError, DataError
+
+NAMES = [*(f"gyro_{a} (rad/s)" for a in "xyz"), *(f"acc_{a} (m/s^2)" for a in "xyz")]
+COUNT, PARTS, RATE_HZ = 200, 3, 50.0
+RNG = np.random.default_rng(5)
+VALUES = np.round(RNG.normal([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], 0.1, (PARTS * COUNT, 6)), 5)
+PART = np.repeat(np.arange(1, PARTS + 1), COUNT)
+T_S = np.tile(np.arange(COUNT) / RATE_HZ, PARTS)
+LETTERS = np.array(["A", "B", "C"])[PART - 1]
+TURNS = np.arange(PARTS * COUNT).reshape(PARTS, COUNT).T.reshape(-1)  # rows of each part by turns
+
+
+def csv(path: Path, columns: dict[str, np.ndarray], rows: np.ndarray | None = None) -> Path:
+    values = [*columns.values(), *VALUES.T]
+    return write_csv(path, [*columns, *NAMES], values if rows is None else [each[rows] for each in values])
+
+
+def logs(path: Path, mapping: dict[str, float] | None = None) -> dict[str, np.ndarray]:
+    """Gyros of the recordings of a table, by name."""
+    read = (table.read_sequence(each, mapping=mapping) for each in table.sequences(path))
+    return {log.name: log.imus["/imu0"].gyro for log in read}
+
+
+def assert_parts(found: dict[str, np.ndarray], names: list[str]) -> None:
+    assert [*found] == names
+    for part, gyro in enumerate(found.values(), 1):
+        np.testing.assert_array_equal(gyro, VALUES[part == PART, :3])
+
+
+TIMED = {"time_s": T_S}
+
+
+@pytest.mark.parametrize("beside", [{}, TIMED])
+@pytest.mark.parametrize(
+    ("column", "labels", "names"),
+    [
+        ("trial", PART, ["all_trial_1", "all_trial_2", "all_trial_3"]),
+        ("Run No", PART, ["all_run_no_1", "all_run_no_2", "all_run_no_3"]),
+        ("session", LETTERS, ["all_A", "all_B", "all_C"]),
+    ],
+)
+def test_a_column_that_tells_recordings_apart_gives_a_log_for_each(tmp_path, column, labels, names, beside):
+    path = csv(tmp_path / "all.csv", {column: labels, **beside})
+    assert_parts(logs(path, {} if beside else {"rate_hz": RATE_HZ}), names)
+    remarks = table.read_sequence(table.sequences(path)[0], mapping={} if beside else {"rate_hz": RATE_HZ}).remarks
+    assert not remarks.losses  # the label is in the name
+
+
+def test_recordings_whose_rows_come_by_turns_are_told_apart(tmp_path):
+    assert_parts(logs(csv(tmp_path / "all.csv", {"user": LETTERS, **TIMED}, TURNS)), ["all_A", "all_B", "all_C"])
+
+
+def test_a_label_that_comes_again_is_another_recording(tmp_path):
+    labels = np.array(["A", "B", "A"])[PART - 1]
+    assert_parts(logs(csv(tmp_path / "all.csv", {"session": labels, **TIMED})), ["all_A", "all_B", "all_A 2"])
+
+
+def test_parquet_holds_several_recordings_too(tmp_path):
+    columns = {"subject": LETTERS.tolist(), "take": PART, **TIMED, **dict(zip(NAMES, VALUES.T, strict=True))}
+    pyarrow.parquet.write_table(pyarrow.table(columns), tmp_path / "all.parquet")
+    assert_parts(logs(tmp_path / "all.parquet"), ["all_take_1_A", "all_take_2_B", "all_take_3_C"])
+
+
+def test_trials_of_one_time_are_one_recording(tmp_path):
+    path = csv(tmp_path / "all.csv", {"trial": PART, "time_s": T_S + 10.0 * PART})
+    (gyro,) = logs(path).values()
+    np.testing.assert_array_equal(gyro, VALUES[:, :3])
+    with pytest.raises(ConfigError, match="'trial' has 3 values") as refused:  # their gaps would be closed
+        logs(path, {"rate_hz": RATE_HZ})
+    assert "Leave `rate_hz` out" in str(refused.value.fix)
+
+
+def test_a_counter_tells_no_recordings_apart(tmp_path):
+    counts = np.arange(PARTS * COUNT)
+    for labels in (counts // 10, counts // 5 % 64):
+        assert len(table.sequences(csv(tmp_path / "all.csv", {"series": labels, **TIMED}))) == 1
+
+
+@pytest.mark.parametrize("rows", [None, TURNS])
+@pytest.mark.parametrize(
+    ("column", "labels", "topics"),
+    [
+        ("sensor", PART, ["/imu_1/imu", "/imu_2/imu", "/imu_3/imu"]),
+        ("placement", np.array(["wrist", "hip", "ankle"])[PART - 1], ["/wrist/imu", "/hip/imu", "/ankle/imu"]),
+    ],
+)
+def test_sensors_of_one_time_are_imus_of_one_log(tmp_path, column, labels, topics, rows):
+    (found,) = table.sequences(csv(tmp_path / "all.csv", {column: labels, **TIMED}, rows))
+    log = table.read_sequence(found)
+    assert [*log.imus] == topics
+    assert not log.remarks.losses
+    for part, imu in enumerate(log.imus.values(), 1):
+        np.testing.assert_array_equal(imu.gyro, VALUES[part == PART, :3])
+
+
+def test_sensors_of_each_trial_are_imus_of_its_log(tmp_path):
+    sensor = np.array(["left", "right"])[np.arange(PARTS * COUNT) % 2]
+    path = csv(tmp_path / "all.csv", {"trial": PART, "sensor": sensor, **TIMED})
+    read = [table.read_sequence(each) for each in table.sequences(path)]
+    assert [[*log.imus] for log in read] == [["/left/imu", "/right/imu"]] * PARTS
+    np.testing.assert_array_equal(read[1].imus["/right/imu"].gyro, VALUES[PART == 2][1::2, :3])
+
+
+def test_a_trial_of_one_row_has_no_time_that_goes_on(tmp_path):
+    trial = np.where(np.arange(PARTS * COUNT) == PARTS * COUNT - 1, 4, PART)
+    sensor = np.array(["left", "right"])[np.arange(PARTS * COUNT) % 2]
+    path = csv(tmp_path / "all.csv", {"trial": trial, "sensor": sensor, **TIMED})
+    assert [each.name for each in table.sequences(path)] == ["all_trial_1", "all_trial_2", "all_trial_3", "all_trial_4"]
+
+
+@pytest.mark.parametrize("beside", [{}, {"time_s": T_S + 10.0 * PART}])
+def test_sensors_that_share_no_time_are_logs_of_their_own(tmp_path, beside):
+    path = csv(tmp_path / "all.csv", {"sensor": PART, **beside})
+    found = logs(path, {} if beside else {"rate_hz": RATE_HZ})
+    assert_parts(found, ["all_sensor_1", "all_sensor_2", "all_sensor_3"])
+
+
+@pytest.mark.parametrize(("name", "values"), [("time_s", T_S), ("sample", np.tile(np.arange(COUNT), PARTS))])
+def test_rows_are_not_counted_across_a_time_or_counter_that_begins_anew(tmp_path, name, values):
+    path = csv(tmp_path / "all.csv", {name: values})
+    with pytest.raises(ConfigError, match=rf"'{name}' begins anew in row 201, as of 3 recordings"):
+        logs(path, {"rate_hz": RATE_HZ})
+    if name == "sample":
+        with pytest.raises(ConfigError, match="begins anew in row 201"):
+            logs(path, {"rate_hz": RATE_HZ, "counter": name})
+
+
+@pytest.mark.parametrize("size", [64, 100])
+def test_a_counter_of_a_few_bits_or_digits_is_counted_through(tmp_path, size):
+    (gyro,) = logs(csv(tmp_path / "all.csv", {"packet": np.arange(PARTS * COUNT) % size}), {"rate_hz": RATE_HZ}).values()
+    np.testing.assert_array_equal(gyro, VALUES[:, :3])
+
+
+def test_a_table_whose_columns_have_several_lengths_is_one_recording(tmp_path):
+    """As of cells with arrays in them; the same table is read twice."""
+    array, few = '"' + str([0.5] * 60) + '"', 50  # more numbers in a cell than rows
+    rows = [f"{n // 25},{array},{n / 100}," + ",".join(map(str, VALUES[n])) for n in range(few)]
+    (tmp_path / "all.csv").write_text(",".join(["id", "array", "time_s", *NAMES]) + "\n" + "\n".join(rows) + "\n")
+    (found,) = table.sequences(tmp_path / "all.csv")
+    for _ in range(2):
+        log = table.read_sequence(found)
+        np.testing.assert_array_equal(log.imus["/imu0"].gyro, VALUES[:few, :3])
+        assert len(log.remarks.notes) == len(set(log.remarks.notes))
+
+
+def test_a_damaged_table_is_refused_when_it_is_read(tmp_path):
+    """The others of its folder are converted."""
+    columns = {"trial": PART, **TIMED, **dict(zip(NAMES, VALUES.T, strict=True))}
+    pyarrow.parquet.write_table(pyarrow.table(columns), path := tmp_path / "all.parquet")
+    path.write_bytes(path.read_bytes()[:-100])
+    (found,) = table.sequences(path)
+    with pytest.raises(DataError, match="cannot be read"):
+        table.read_sequence(found)
