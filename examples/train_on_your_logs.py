@@ -14,7 +14,8 @@ import imutool
 
 
 def show(epoch: Any) -> None:
-    print(f"{epoch.sensor:>5} {epoch.step:4d}/{epoch.steps}: held out {epoch.held_out:.4f}, closed form {epoch.before:.4f}")
+    step = f"{epoch.sensor:>5} {epoch.step:4d}/{epoch.steps}: held out {epoch.held_out:.4f}, closed form {epoch.before:.4f}"
+    print(epoch.note or step)
 
 
 def main(model: str, logs: Sequence[str], settings: dict[str, Any]) -> None:

@@ -322,11 +322,11 @@ float32 v
 """
     fields = ros2_definition.parse("a/msg/A", text)["a/A"]
     assert [tuple(field) for field in fields] == [
-        ("header", "std_msgs/Header", None),
-        ("few", "float64", 0),
-        ("short", "string", None),
-        ("with_default", "int16", None),
-        ("inner", "a/Inner", 2),
+        ("header", "std_msgs/Header", None, "a comment"),
+        ("few", "float64", 0, "bounded"),
+        ("short", "string", None, "a comment"),
+        ("with_default", "int16", None, "a comment"),
+        ("inner", "a/Inner", 2, "a comment"),
     ]
 
 
