@@ -33,9 +33,7 @@ from imutool.training.training_windows import Pool, without_motion
 from imutool.units import Sensor
 
 CANDIDATES = ("constant", "linear", "effects")  # from the simplest
-PARTS_GAIN = (
-    0.3  # of the loss: effects that other logs refute take 0.21 off parts of a log of EuRoC, FETCH's curve 0.6 and more
-)
+PARTS_GAIN = 0.3  # of the loss: false effects take up to 0.21 off parts of one log of EuRoC, FETCH's curve 0.6 and more
 
 
 def known(fit: Calibration, candidate: str, sensor: Sensor) -> bool:
