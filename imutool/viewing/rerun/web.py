@@ -29,7 +29,7 @@ TYPES = {
     ".wasm": "application/wasm",
     ".rrd": "application/octet-stream",
 }
-START_TIMEOUT_S, FETCH_TIMEOUT_S = 1.5, 10.0
+FETCH_TIMEOUT_S = 10.0
 LOCAL = ("127.0.0.1", "localhost")
 
 # Rerun's own page asks four hosts for fonts, news and statistics; this one may ask only the server it came from.
@@ -82,7 +82,7 @@ def viewer_files() -> dict[str, bytes]:
     grpc, port = viewer.free_port(), viewer.free_port()
     process = viewer.run("--serve-web", "--port", str(grpc), "--web-viewer-port", str(port))
     try:
-        if not viewer.listens(process, port, START_TIMEOUT_S):
+        if not viewer.listens(process, port, viewer.START_TIMEOUT_S):
             raise ConfigError("Rerun's program does not serve the viewer's web page", where=viewer.binary())
         files = {}
         for name in RERUN_FILES:
