@@ -25,6 +25,7 @@ from ._table_text import Columns, no_numbers
 from ._table_times import LEAST_ROWS, begun_anew, is_counter
 
 NOT_BACK, UP = 0.99, 0.5  # shares of the steps of a time that do not go back, and that go on
+LONGEST_LABEL = 40  # characters, of a file's name
 MOST_BY_TURNS = 60  # recordings whose rows come by turns
 FIX = (
     "Leave `rate_hz` out if a column is the time of each row; else give each recording a table of its own, or name the column"
@@ -160,7 +161,7 @@ def _apart(columns: Columns, labels: Labels, *, always: bool = False) -> dict[st
 
 def _part_name(column: str, text: str) -> str:
     """Name of a recording by its label: `trial_3`, and `S01` for a label that is no number."""
-    plain = re.sub(r"[^\w.+-]+", "_", text).strip("_.") or "blank"
+    plain = re.sub(r"[^\w.+-]+", "_", text).strip("_.")[:LONGEST_LABEL] or "blank"
     return f"{split_name(column)[0] or 'part'}_{plain}" if plain.isdigit() else plain
 
 

@@ -101,7 +101,7 @@ class Steps:
 class IncreasingStamps:
     """Steps of stamps in blocks, with pauses and jumps of their clock.
 
-    `increasing` is false from the first stamp on that repeats or goes back; what follows is then for nothing.
+    `increasing` is false from the first stamp on that repeats or goes back. Then the steps and jumps have no meaning.
     """
 
     def __init__(self) -> None:

@@ -171,7 +171,7 @@ def check_conventions(recordings: Iterable[Recording]) -> None:
 
 @np.errstate(over="ignore", invalid="ignore")
 def check_motion(motion: ImuMotion, truth: Truth | None, where: str) -> None:
-    """The same of samples and poses that came in blocks.
+    """Check units, axes and frames of samples and poses that came in blocks.
 
     Raises:
         DataError: what `convert --fix` corrects.

@@ -11,6 +11,7 @@ import pytest
 from support.tables import write_csv
 
 from imutool.converters import table
+from imutool.converters._table_parts import LONGEST_LABEL
 from imutool.errors import ConfigError, DataError
 
 NAMES = [*(f"gyro_{a} (rad/s)" for a in "xyz"), *(f"acc_{a} (m/s^2)" for a in "xyz")]
@@ -57,6 +58,13 @@ def test_a_column_that_tells_recordings_apart_gives_a_log_for_each(tmp_path, col
     assert_parts(logs(path, {} if beside else {"rate_hz": RATE_HZ}), names)
     remarks = table.read_sequence(table.sequences(path)[0], mapping={} if beside else {"rate_hz": RATE_HZ}).remarks
     assert not remarks.losses  # the label is in the name
+
+
+def test_labels_that_are_no_names_of_files_become_some(tmp_path):
+    labels = np.array(["../../a", "x" * 300, "å b"])[PART - 1]
+    assert_parts(
+        logs(csv(tmp_path / "all.csv", {"trial": labels, **TIMED})), ["all_a", f"all_{'x' * LONGEST_LABEL}", "all_å_b"]
+    )
 
 
 def test_recordings_whose_rows_come_by_turns_are_told_apart(tmp_path):
