@@ -24,9 +24,9 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from imu_defects import survey
+from support.imu_defects import survey
 
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from imu_defects import late, messages, repeated, survey, with_values, without
+from support.imu_defects import late, messages, repeated, survey, with_values, without
 
 from imutool.cleaning.survey import examine
 from imutool.cleaning.truth import read_truth

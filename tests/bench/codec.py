@@ -47,13 +47,14 @@ def encode(t_ns: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> list[bytes]
 
 def decode(chunks: list[bytes]) -> list[ImuColumns]:
     """The columns in chunks of message records."""
-    found = []
+    decoded = []
     for chunk in chunks:
         found = messages.parse(chunk, 0)
-        for rows in messages.rows(found, found.heads["channel"] == 1):
+        for heads, payload in messages.cut(found, found.of_channels([1])):
+            rows = messages.columns(heads, payload)
             for part, layout in schemas.runs(rows.payload, schemas.IMU):
-                found.append(decode_imu(rows.payload[part], "cdr", layout))
-    return found
+                decoded.append(decode_imu(rows.payload[part], "cdr", layout))
+    return decoded
 
 
 def their_messages(t_ns: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> list[dict[str, object]]:
@@ -86,19 +87,19 @@ def main() -> None:
     text = schemas.definition(schemas.IMU)
     serialize = serialize_dynamic(schemas.IMU, text)[schemas.IMU]
     deserialize = generate_dynamic(schemas.IMU, text)[schemas.IMU]
-    messages = their_messages(t_ns, gyro, accel)
-    payloads = [serialize(message) for message in messages]
+    samples = their_messages(t_ns, gyro, accel)
+    payloads = [serialize(sample) for sample in samples]
     assert payloads[0] == chunks[0][31 : 31 + len(payloads[0])]
 
     def their_encode() -> None:
         builder = RecordBuilder()
-        for i, message in enumerate(messages):
+        for i, sample in enumerate(samples):
             time_ns = int(t_ns[i])
-            Message(1, time_ns, serialize(message), time_ns, i).write(builder)
+            Message(1, time_ns, serialize(sample), time_ns, i).write(builder)
 
     theirs = {
-        "encode": len(messages) / best(their_encode),
-        "decode": len(messages) / best(lambda: [deserialize(payload) for payload in payloads]),
+        "encode": len(samples) / best(their_encode),
+        "decode": len(samples) / best(lambda: [deserialize(payload) for payload in payloads]),
     }
     ours = {
         "encode": count / best(lambda: encode(t_ns, gyro, accel)),

@@ -43,6 +43,7 @@ from jaxtyping import Float64
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from support.benchmarks import recordings
 from support.covariance_factors import Judgement, coverage, features_of, with_factor, with_head
 from support.error_growth import Judged, Motion
 from support.nees import consistency
@@ -56,12 +57,10 @@ from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.model_choice import estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.geometry import so3
 from imutool.inertial.windows import running_product, step_means
-from imutool.mcap_io.read import read
 from imutool.recording import Poses, Recording
 
 STARTS = ("truth", "auto", "smooth")
 WINDOWS_S = (1.0, 5.0, 15.0)
-RECOMPUTED = "/ground_truth_recomputed/pose"
 TRAINING, TESTS = 4, 3
 
 
@@ -104,8 +103,7 @@ def main() -> None:
 
 def recorded(paths: list[Path], model: Path | None) -> Iterator[Case]:
     """Logs with a model, or each with the closed form of all others."""
-    logs = [read(path) for path in paths]
-    logs = [r.with_truth(RECOMPUTED if RECOMPUTED in r.truths else next(iter(r.truths))) for r in logs]
+    logs = recordings(paths)
     for one in logs:
         if model and str(model) == static.Model.method:
             yield Case(one, static.Model())

@@ -16,7 +16,6 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-import pysindy
 from jaxtyping import Float64
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -57,6 +56,8 @@ def library(state: dict[str, Float64[np.ndarray, " n"]]) -> dict[str, Float64[np
 
 def by_pysindy(folder: Path, form: str) -> tuple[bool, list[str]]:
     """Whether STLSQ keeps the form alone, and what it keeps."""
+    import pysindy
+
     settings = DiagnoseSettings()
     (pair,) = [pair for pair in paired(folder / "real.mcap", folder / "sim.mcap").pairs if pair.kind == "efforts"]
     signal = aligned(pair, {}, settings)

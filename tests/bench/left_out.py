@@ -16,10 +16,15 @@ deviations that the minute leaves, each started in the log as its own model is (
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from support.benchmarks import recordings
 
 from imutool.array_types import Bool
 from imutool.bias import hybrid
@@ -30,7 +35,6 @@ from imutool.config import load
 from imutool.errors import ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
-from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording, nanoseconds
 from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.calibration.effect_selection import PhysicsFirst
@@ -52,15 +56,14 @@ def main() -> None:
     parser.add_argument("--switched-on-again", action="store_true", help="the log left out gets another turn-on bias")
     options = parser.parse_args()
     starts = options.start or list(STARTS)
-    recordings = [read(log) for log in options.logs]
-    recordings = [r.with_truth(next(iter(r.truths))) for r in recordings]
+    logs = recordings(options.logs)
     if options.minute:
-        minutes(recordings, options.start or list(SCORED), options.set)
+        minutes(logs, options.start or list(SCORED), options.set)
         return
     print(f"| left out | {' | '.join(starts)} | effects |\n|{'---|' * (len(starts) + 2)}")
     table, rng = [], np.random.default_rng(5)
-    for left_out in recordings:
-        model = learned([r for r in recordings if r is not left_out], options.set)
+    for left_out in logs:
+        model = learned([r for r in logs if r is not left_out], options.set)
         scored = replace(left_out, imu=moved(left_out.imu, rng)) if options.switched_on_again else left_out
         table.append([aoe(model, scored, start) for start in starts])
         found = ", ".join((*(model.config.gyro_effects or ()), *(model.config.accel_effects or ())))

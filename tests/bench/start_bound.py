@@ -23,12 +23,17 @@ The variogram also holds the walk of the bias within the log, which hides the lo
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.optimize import nnls
-from starts import aoe, own_bias, samples, with_best_truth
+from starts import aoe, own_bias, samples
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from support.benchmarks import recordings
 
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import load
@@ -37,7 +42,6 @@ from imutool.bias_start.bias_tracking import filter_blocks, smooth_blocks
 from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.geometry import quaternion
 from imutool.inertial.strapdown import along_truth
-from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording, seconds
 
 START_S = 15.0
@@ -54,10 +58,10 @@ def main() -> None:
     parser.add_argument("--model", type=Path, required=True)
     options = parser.parse_args()
     model = load(options.model)
-    recordings = [with_best_truth(read(log)) for log in options.logs]
+    logs = recordings(options.logs)
     print(f"{'':16}" + "".join(f"{column:>9}" for column in COLUMNS) + "   deviation of the start's bias, rad/s")
     rows = []
-    for recording, own in zip(recordings, own_bias(model, recordings), strict=True):
+    for recording, own in zip(logs, own_bias(model, logs), strict=True):
         row, std = bound(model, recording, InitialBias(own, np.zeros(6), "own"))
         rows.append(row)
         print(

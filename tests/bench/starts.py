@@ -16,6 +16,7 @@ clip of 20 instead of 2 deg/s. Below stands how consistent `auto` is: the mean N
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from pathlib import Path
 
@@ -23,6 +24,10 @@ import numpy as np
 import torch
 import vqf
 from thawed import thawed
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from support.benchmarks import recordings
 
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias.model_file import load
@@ -32,14 +37,12 @@ from imutool.bias_start.initial_bias import InitialBias
 from imutool.errors import DataError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
-from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording, seconds
 from imutool.training.calibration import closed_form
 from imutool.training.training_windows import Pool, corrected
 
 CLIP_DEG_S = 20.0
 WINDOW_S = {"gyro": (15.0,), "accel": (2.0,)}
-RECOMPUTED = "/ground_truth_recomputed/pose"
 COLUMNS = ("truth", "prior", "rest", "VQF", "VQF all", "auto", "smooth", "oracle")
 
 
@@ -50,23 +53,17 @@ def main() -> None:
     parser.add_argument("--model", type=Path, required=True)
     options = parser.parse_args()
     model = load(options.model)
-    recordings = [with_best_truth(read(log)) for log in options.logs]
-    oracle = own_bias(model, recordings)
+    logs = recordings(options.logs)
+    oracle = own_bias(model, logs)
     print(f"{'':16}" + "".join(f"{column:>9}" for column in COLUMNS) + "   s: auto, smooth; how")
     rows, nees = [], []
-    for i, recording in enumerate(recordings):
+    for i, recording in enumerate(logs):
         row, how, error, P = score(model, recording, oracle[i])
         rows.append(row)
         nees.append(error @ np.linalg.solve(P, error))
         print(f"{recording.name:16}" + "".join(f"{value:9.2f}" for value in row) + how, flush=True)
     print(f"{'mean':16}" + "".join(f"{value:9.2f}" for value in np.mean(rows, axis=0)))
     print(f"NEES of auto's last gyro bias: mean {np.mean(nees):.1f}, each {np.round(nees, 1).tolist()}")
-
-
-def with_best_truth(recording: Recording) -> Recording:
-    """The recomputed truth where there is one (V1_01), else the log's first."""
-    truths = list(recording.truths)
-    return recording.with_truth(RECOMPUTED if RECOMPUTED in truths else truths[0])
 
 
 def score(model: BiasModel, recording: Recording, own: Vector6) -> tuple[list[float], str, np.ndarray, np.ndarray]:

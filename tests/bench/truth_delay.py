@@ -1,9 +1,8 @@
 """How late the truth is behind the gyro, under two rules of integration: `python tests/bench/truth_delay.py LOG...`.
 
 Held: each sample holds until the next (Euler). Mean: a step sees the mean of its two ends (`imutool.inertial.windows`). A
-truth that
-is late by tau adds omega_end tau - dR^T omega_start tau to the residual of a window; tau is fitted robustly over windows of
-one second, each log's bias solved for first. Prints tau in ms and the median residual in degrees with tau taken out.
+truth that is late by tau adds omega_end tau - dR^T omega_start tau to the residual of a window; tau is fitted robustly over
+windows of one second, each log's bias solved for first. Prints tau in ms and the median residual in degrees with tau taken out.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from imutool.bias.networks.linear import Network
 from imutool.geometry import so3
-from imutool.inertial.windows import rotation_residual, whole_product
+from imutool.inertial.windows import rotation_residual, whole_turn
 from imutool.mcap_io.read import read
 from imutool.training.calibration import closed_form
 from imutool.training.training_windows import Pool
@@ -36,7 +35,7 @@ def main() -> None:
         windows = pool.windows(first, n, rest.expand(len(first), 6))
         gyro = windows.segment.gyro - rest[:, None, :3]
         dR = windows.R_start.mT @ windows.R_end
-        held = so3.log(whole_product(so3.exp(gyro[:, :-1] * windows.dt[..., None])).mT @ dR)
+        held = so3.log(whole_turn(gyro[:, :-1] * windows.dt[..., None]).mT @ dR)
         mean, _ = rotation_residual(gyro, windows.dt, dR)
         turn = gyro[:, -1] - (dR.mT @ gyro[:, 0, :, None])[..., 0]
         figures = [figure for e in (held, mean) for figure in delay(e.flatten(), turn.flatten())]

@@ -19,9 +19,6 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.signal import periodogram
 from scipy.stats import kurtosis
-from sklearn.ensemble import HistGradientBoostingClassifier
-from sklearn.metrics import roc_auc_score
-from sklearn.model_selection import GroupKFold, cross_val_predict
 
 from imutool.mcap_io.read import read
 from imutool.recording import Imu
@@ -49,6 +46,10 @@ def features(imu: Imu, begins_ns: Float64[np.ndarray, " w"]) -> Float64[np.ndarr
 
 def auc(real: Float64[np.ndarray, "w f"], made: Float64[np.ndarray, "w f"]) -> float:
     """Area under the curve on blocks that were not trained on."""
+    from sklearn.ensemble import HistGradientBoostingClassifier
+    from sklearn.metrics import roc_auc_score
+    from sklearn.model_selection import GroupKFold, cross_val_predict
+
     blocks = np.arange(len(real)) // round(BLOCK_S / WINDOW_S)
     x, y, groups = np.concatenate([real, made]), np.repeat([0, 1], len(real)), np.tile(blocks, 2)
     model = HistGradientBoostingClassifier(max_iter=100, random_state=0)

@@ -12,23 +12,26 @@ what changes within the log and the truth's own errors at the ends of windows (h
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from support.benchmarks import recordings
+
 from imutool.bias.model_file import load
 from imutool.bias_start.correction import apply
 from imutool.bias_start.model_choice import find_initial_bias
 from imutool.inertial.strapdown import GRAVITY_W, StartPose, along_truth, dead_reckon, drift, with_velocity
-from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording, seconds
 
 WINDOW_S, EVERY_S = 5.0, 1.0
 CONSTANTS = 27
 STEP = np.concatenate([np.full(12, 1e-5), np.full(15, 1e-4)])
 ROUNDS = 3
-RECOMPUTED = "/ground_truth_recomputed/pose"
 
 
 def main() -> None:
@@ -40,10 +43,7 @@ def main() -> None:
     models = [load(path) for path in options.model]
     print(f"| m/s after {WINDOW_S:g} s | {' | '.join(path.stem for path in options.model)} | own constants |")
     print("|---" * (len(models) + 2) + "|")
-    for path in options.logs:
-        recording = read(path)
-        truths = list(recording.truths)
-        recording = recording.with_truth(RECOMPUTED if RECOMPUTED in truths else truths[0])
+    for recording in recordings(options.logs):
         debiased = [apply(model, find_initial_bias("truth", model, recording), recording.imu).imu for model in models]
         drifts = [drift(*along_truth(imu, recording.truth, recording.name), WINDOW_S) for imu in debiased]
         cells = [float(np.sqrt(np.mean(one.velocity_m_s**2))) for one in drifts]

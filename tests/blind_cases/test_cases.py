@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
 import json
 import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +16,7 @@ import pytest
 from numpy.random import default_rng
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
+from support.benchmarks import benchmark
 from support.made_once import made_once
 from support.report_schema import assert_valid
 
@@ -75,17 +74,7 @@ def scored(truth: dict[str, Any], findings: dict[str, Any]) -> dict[str, Any]:
     return as_json(score(to_truth(truth, WHERE), findings, WHERE))
 
 
-def _bench(name: str) -> Any:
-    """A module of tests/bench, which is no package."""
-    spec = importlib.util.spec_from_file_location(f"bench_{name}", ROOT / "tests/bench" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
-POSES = _bench("pose_detectability")
+POSES = benchmark("pose_detectability")
 
 
 # ── the generator's own hand ──
@@ -629,7 +618,7 @@ def test_the_command_conceals_and_opens(
 
 
 def test_cases_are_dealt_in_proportion_whatever_their_number() -> None:
-    bench = _bench("diagnose")
+    bench = benchmark("diagnose")
     deck = bench.deck()
     assert {effect for task in deck for effect in task.effects} == {*CATALOGUE, *catalogue.FORMS}
     for count in (40, len(deck), 200):
@@ -643,7 +632,7 @@ def test_cases_are_dealt_in_proportion_whatever_their_number() -> None:
 
 
 def test_a_line_of_scores_becomes_a_row() -> None:
-    bench = _bench("diagnose")
+    bench = benchmark("diagnose")
     said = _findings([_finding("gyro_scale", "gyro", x=(0.12, 0.01), y=(-0.2, 0.01))])
     line = {"case": 0, "effects": ["gyro_scale"], "seconds": 2.0, "failed": "", **scored(_truth(SCALE), said)}
     wrong = {**line, **scored(_truth(SCALE), _findings([_finding("low_pass", "gyro")]))}
@@ -657,7 +646,7 @@ def test_a_line_of_scores_becomes_a_row() -> None:
 
 def test_mujoco_moves_a_lever_arm_as_mechanics_says() -> None:
     pytest.importorskip("mujoco", reason="the second generator is MuJoCo's")
-    cases = _bench("mujoco_cases")
+    cases = benchmark("mujoco_cases")
     r = (0.1, -0.05, 0.08)
     flown = cases.fly(cases.Mounted(lever_m=r), 4.0, default_rng(1))
     omega = flown.ideal[:, :3]
@@ -671,7 +660,7 @@ def test_mujoco_moves_a_lever_arm_as_mechanics_says() -> None:
 def test_mujocos_accelerometer_reads_what_its_poses_do() -> None:
     """No half a step ahead of them, as forces that are held for a step would have it."""
     pytest.importorskip("mujoco", reason="the second generator is MuJoCo's")
-    cases = _bench("mujoco_cases")
+    cases = benchmark("mujoco_cases")
     flown = cases.fly(cases.Mounted(), 2.0, default_rng(1))
     a_w = make_interp_spline(flown.t_s, flown.p_wb, k=5)(flown.t_s, 2)
     R_wb = Rotation.from_quat(flown.q_wb_wxyz, scalar_first=True)
@@ -682,7 +671,7 @@ def test_mujocos_accelerometer_reads_what_its_poses_do() -> None:
 
 def test_mujoco_and_our_rotating_mount_agree() -> None:
     pytest.importorskip("mujoco", reason="the second generator is MuJoCo's")
-    cases = _bench("mujoco_cases")
+    cases = benchmark("mujoco_cases")
     turn = (0.05, -0.03, 0.08)
     flown = cases.fly(cases.Mounted(rotation_rad=turn), 2.0, default_rng(1))
     assert np.abs(flown.real - CATALOGUE["mount_rotation"].act(RATE_HZ, flown.ideal, np.array(turn))).max() < 1e-9
@@ -690,7 +679,7 @@ def test_mujoco_and_our_rotating_mount_agree() -> None:
 
 def test_a_case_of_mujoco_opens_like_any_other(tmp_path: Path) -> None:
     pytest.importorskip("mujoco", reason="the second generator is MuJoCo's")
-    _bench("mujoco_cases").conceal_mujoco(tmp_path / "case", seed=3, kind="lever_arm+clock_offset", duration_s=8.0)
+    benchmark("mujoco_cases").conceal_mujoco(tmp_path / "case", seed=3, kind="lever_arm+clock_offset", duration_s=8.0)
     (tmp_path / "case" / FINDINGS).write_text(json.dumps(_findings([_finding("lever_arm", "accel")])))
     out = opened(tmp_path / "case")
     assert (out["kind"], out["hits"], out["missing"]) == ("pair", ["lever_arm"], ["clock_offset"])

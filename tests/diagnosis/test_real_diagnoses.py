@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import shift
 from support import planted
+from support.benchmarks import benchmark
 
 from imutool.mcap_io.write import write
 
-BENCH = Path(__file__).parents[1] / "bench"
 EXACT = 1e-12
 DRAWS = 2000
 OF_ONE = 0.05  # z of so many honest draws lies as near to 1: its own deviation is 1 / sqrt(2 * 2000)
@@ -26,29 +24,19 @@ LONG_S, MOST_LAG_STD_S = 90.0, 2e-3  # time that shows a lag at 0.3 Hz; a deviat
 POSE_NOISE = 0.05  # of what the lever arm adds: how inexact splines through exact poses may be
 
 
-def _load(name: str) -> Any:
-    """A module of tests/bench, which is no package."""
-    spec = importlib.util.spec_from_file_location(name, BENCH / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture(scope="module")
 def tables() -> Any:
-    return _load("sensor_tables")
+    return benchmark("sensor_tables")
 
 
 @pytest.fixture(scope="module")
-def bench(tables: Any) -> Any:
-    return _load("real_diagnoses")
+def bench() -> Any:
+    return benchmark("real_diagnoses")
 
 
 @pytest.fixture(scope="module")
-def check(tables: Any) -> Any:
-    return _load("reference_check")
+def check() -> Any:
+    return benchmark("reference_check")
 
 
 def test_equal_deviations_make_the_mean_plain_and_z_the_spread_in_sigmas(tables: Any) -> None:

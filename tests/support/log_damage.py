@@ -11,15 +11,17 @@ import io
 import os
 import random
 import signal
+import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages
-from imutool.mcap_io.codec.records import HEAD
+from imutool.mcap_io.codec.records import HEAD, MAGIC
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
@@ -27,10 +29,13 @@ from imutool.mcap_io.repair import repair
 
 Message = tuple[str, int, int, int, bytes]  # topic, log time, publish time, sequence, payload
 
-CASES = 160  # seeded corruptions of a log
+CASES = 80  # seeded corruptions of a log in each layout
 BUDGET_S = 5.0  # for one small file: it takes milliseconds
 KINDS = ("flip", "zero", "length", "garbage", "cut", "duplicate", "remove", "reorder", "join", "several")
 IN_PLACE = KINDS[:5]  # what is not damaged by these lies where it lay
+NEAR = range(-1, 3)  # bytes around the first of a record where a log is cut: in its head and in the end of the one before
+APART = 7  # bytes between other cuts: no length of a head, and of no record
+CHUNK_TIMES, RECORDS_SIZE, NAME_SIZE = 28, 8, struct.Struct("<I")  # bytes of a chunk before and after its compression
 DOUBTFUL = 3  # messages outside chunks that may be given up for nothing: nothing shows where the one before a damage ends
 
 
@@ -132,16 +137,35 @@ _cut: set[bytes] = set()
 """Digests of the cut files that were looked at: layouts that differ in their summary alone are the same up to it."""
 
 
-def after_a_cut(path: Path, step: int = 1) -> Iterator[str]:
-    """Cuts the file shorter by `step` bytes a time; all messages before the cut must come back, and the cut be told."""
+def edges(raw: bytes) -> set[int]:
+    """First bytes of all records of a log, of those in its unpacked chunks too, and of the closing magic."""
+    found, ends = set[int](), [(len(MAGIC), len(raw) - len(MAGIC))]
+    for first, end in ends:
+        at = first
+        while at < end:
+            opcode, length = HEAD.unpack_from(raw, at)
+            found.add(at)
+            body, at = at + HEAD.size, at + HEAD.size + length
+            if opcode == Opcode.CHUNK:
+                (size,) = NAME_SIZE.unpack_from(raw, body + CHUNK_TIMES)
+                ends += [] if size else [(body + CHUNK_TIMES + NAME_SIZE.size + RECORDS_SIZE, at)]
+    return found | {len(raw) - len(MAGIC)}
+
+
+def after_a_cut(path: Path) -> Iterator[str]:
+    """Cuts the file at and around every record and at every `APART` bytes.
+
+    All messages before the cut must come back, and the cut be told.
+    """
     whole, raw, running, new = stretches(path), path.read_bytes(), hashlib.sha256(), []
+    cuts = {edge + near for edge in edges(raw) for near in NEAR} | set(range(0, len(raw), APART))
     end_of_data = max(end for _, end, _ in whole)
     for cut in range(len(raw)):
-        if (digest := running.digest()) not in _cut:
+        if cut in cuts and (digest := running.digest()) not in _cut:
             new.append(cut)
             _cut.add(digest)
         running.update(raw[cut : cut + 1])
-    for cut in new[::-step]:
+    for cut in reversed(new):
         os.truncate(path, cut)
         theory = [message for _, end, each in whole if end <= cut for message in each]
         try:
@@ -158,7 +182,7 @@ def after_a_cut(path: Path, step: int = 1) -> Iterator[str]:
             yield f"cut at {cut}: not told"
 
 
-def after_corruption(path: Path, other: Path) -> Iterator[str]:
+def after_corruption(path: Path, other: Path, seed: str) -> Iterator[str]:
     """Damages the file by seed; sound messages must come back, others not, and the file stay as it is."""
     whole, raw, joined = stretches(path), path.read_bytes(), other.read_bytes()
     every = Counter(message for _, _, each in whole for message in each)
@@ -166,7 +190,7 @@ def after_corruption(path: Path, other: Path) -> Iterator[str]:
     with Log(path) as log:
         chunked = any(block.compression is not None for block in log.index.blocks)
     for case in range(CASES):
-        rng, kind = random.Random(f"{path.name} {case}"), KINDS[case % len(KINDS)]
+        rng, kind = random.Random(f"{seed} {case}"), KINDS[case % len(KINDS)]
         broken = damaged(raw, kind, rng, joined)
         path.write_bytes(broken)
         with in_time():
@@ -199,6 +223,7 @@ def check(
     sound = Counter(m for start, end, each in whole if broken[start:end] == raw[start:end] for m in each)
     if losses.unchecked_topics:  # a topic may be called otherwise now, which is told
         sound, found = Counter(("", *m[1:]) for m in sound.elements()), [("", *m[1:]) for m in found]
+        whole = [(start, end, [("", *m[1:]) for m in each]) for start, end, each in whole]
     missed = (sound - Counter(found)).total()
     if missed > (0 if chunked else DOUBTFUL) and not any("not defined" in line for line in lines):
         yield f"{missed} sound messages missing: {lines}"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from imutool.viewing.model.run_data import RunData, Trace
+from imutool.viewing.model.run_data import IN_LOG, RunData, Trace
 from imutool.viewing.model.trajectory_error import row_of_largest
 
 FIGURE_LABELS = {
@@ -34,8 +34,9 @@ def raw_run(data: RunData) -> Trace | None:
 
 
 def run_name(trace: Trace) -> str:
-    """Name of a run within a sentence."""
-    return trace.name.removeprefix("in the log: ")
+    """Name of a run within a sentence; samples of the log are told from those of the same model."""
+    model = trace.name.removeprefix(IN_LOG)
+    return trace.name if model == trace.name else f"{model} (in the log)"
 
 
 def format_number(value: float | None) -> str:

@@ -23,7 +23,7 @@ from imutool.mcap_io.temperature import with_temperatures
 from imutool.mcap_io.topics import DERIVED_KEY, UNSET_FIX
 from imutool.recording import Imu, Recording
 from imutool.recording.columns import clock_jumps, jump_warnings, longest_run
-from imutool.viewing.model.run_data import LogTimes, Run
+from imutool.viewing.model.run_data import IN_LOG, LogTimes, Run
 
 MIN_SAMPLES = 2  # samples that make a log, and poses that make a trajectory
 NO_SAMPLES = Imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
@@ -186,7 +186,7 @@ def _run(
         imu, _ = _columns(batches)
     except DataError:
         return None
-    called = f"in the log: {model}" if model else name.rpartition("/")[2]
+    called = f"{IN_LOG}{model}" if model else name.rpartition("/")[2]
     for parts in filter(None, biases_by_topic.values()):
         stamp_ns, angular, linear, variance = (np.concatenate(column) for column in list(zip(*parts, strict=True))[:4])
         sound = all(np.isfinite(column).all() for column in (angular, linear, variance)) and (variance >= 0.0).all()

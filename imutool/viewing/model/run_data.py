@@ -24,6 +24,7 @@ from imutool.viewing.model.events import Event
 from imutool.viewing.model.trajectory_error import Alignment, Drift, Errors, Window
 
 RAW = "raw"
+IN_LOG = "in the log: "  # before the name of the model whose samples a log holds
 TRUTH = "truth"  # label of the truth; no run may have this name
 LEVELLING_S = 0.5  # without truth, the mean specific force of this time gives the vertical
 HIDDEN_FIGURES = ("aoe_aligned_deg",)  # aligned positions say nothing about the attitude of a path that drifts by metres

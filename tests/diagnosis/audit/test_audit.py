@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.audit_bench import bench
+from support.benchmarks import benchmark
 from support.report_schema import assert_valid
 from support.seeds import seeds
 
@@ -31,6 +31,7 @@ from imutool.mcap_io.write import Series, chunks, write
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu, Poses, Recording
 
+bench = benchmark("audit")
 DURATION_S = 16.0
 Command = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt
-from support.audit_bench import bench
+from support.benchmarks import benchmark
 
 from imutool.config import build
 from imutool.diagnosis.audit import simulator_faults
@@ -21,6 +21,7 @@ from imutool.diagnosis.result import Estimate
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu
 
+bench = benchmark("audit")
 DURATION_S = 16.0
 
 

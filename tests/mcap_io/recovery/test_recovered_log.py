@@ -131,19 +131,19 @@ def ways() -> Iterator[Callable[..., str]]:
         yield lambda damage, *how: pool.submit(log_damage.findings, damage, *how).result(timeout=240)
 
 
-def test_cut_at_any_byte_all_that_is_whole_before_it_comes_back(
+def test_cut_at_and_around_every_record_all_that_is_whole_before_it_comes_back(
     foreign: Foreign, layout: str, ways: Callable[..., str]
 ) -> None:
     path = foreign(some(2, 4), layout, chunk_size=100, attachments=(b"abc",), metadata={"v": {"id": "7"}})
-    assert ways(log_damage.after_a_cut, path, 1 if layout in ("zstd", "unchunked") else 3) == ""
+    assert ways(log_damage.after_a_cut, path) == ""
 
 
-def test_of_thousands_of_corruptions_none_hangs_crashes_or_passes_bad_messages_on(
+def test_of_a_thousand_corruptions_none_hangs_crashes_or_passes_bad_messages_on(
     foreign: Foreign, layout: str, ways: Callable[..., str]
 ) -> None:
     first = foreign(some(3, 24), layout, chunk_size=300, attachments=(b"abc" * 30,), metadata={"v": {"id": "7"}}, name="a")
     second = foreign(some(4, 24, ("/c", "/b"), 10**18 + 10**9), layout, chunk_size=300, name="b")
-    assert ways(log_damage.after_corruption, first, second) == ""
+    assert ways(log_damage.after_corruption, first, second, layout) == ""
 
 
 def test_cut_at_and_around_every_record_of_a_larger_log(foreign: Foreign, flight: Messages, tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def panel(data: RunData, make: Callable[[RunData], drawing.Picture | None], whic
 def test_the_conclusion_comes_first_and_holds_the_figures_of_the_best_model(seen: RunData, page: str) -> None:
     whole = seen.traces[2].figures
     said = Page(page).text
-    assert said.index("whole cuts the orientation error") < said.index("Figures")
+    assert said.index("whole (in the log) cuts the orientation error") < said.index("Figures")
     assert f"from {report_wording.format_quantity(seen.traces[0].figures['aoe_deg'], '°')} to" in said
     less = report_wording.ratio_text(seen.traces[0].figures["aoe_deg"], whole["aoe_deg"])
     assert f"to {report_wording.format_quantity(whole['aoe_deg'], '°')} ({less})" in said
@@ -104,6 +104,16 @@ def test_the_conclusion_comes_first_and_holds_the_figures_of_the_best_model(seen
     worst = report_wording.format_quantity(float(errors.orientation_total_deg[row]), "°")
     at = report_wording.format_number(float(seen.elapsed_s(errors.t_ns)[row]))
     assert f"without alignment. The largest orientation error is {worst} at {at} s." in said
+
+
+def test_samples_of_the_log_and_of_the_same_model_have_two_names_in_a_caption(seen: RunData) -> None:
+    raw, _, logged = seen.traces
+    far = [replace(trace, path=replace(trace.path, p_wb=trace.path.p_wb + 1e4)) for trace in (raw, logged)]
+    far.append(replace(far[1], run=replace(logged.run, name="whole")))
+    picture = report_paths.paths(replace(seen, traces=tuple(far)))
+    assert picture is not None
+    assert "whole (in the log) leaves" in picture.caption
+    assert ". whole leaves" in picture.caption
 
 
 def test_a_model_that_does_harm_is_not_praised(seen: RunData) -> None:
@@ -324,7 +334,7 @@ def test_paths_have_equal_scales_and_one_that_leaves_is_said(seen: RunData) -> N
     picture = report_paths.paths(replace(seen, traces=(raw, half, near)))
     assert "half leaves the first two pictures and ends" in picture.caption
     assert "raw leaves every picture and ends" in picture.caption
-    assert "whole leaves" not in picture.caption
+    assert "whole (in the log) leaves" not in picture.caption
     assert len(picture.panels) == 4
     assert len(report_paths.paths(replace(seen, traces=(raw, near))).panels) == 2
 
