@@ -17,8 +17,9 @@ import numpy as np
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses
-from imutool.recording.joined_imu import in_order, joined
+from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import MessageLog, Remarks, Table
+from imutool.recording.sample_order import in_order
 
 from . import Sequence
 from ._archive import refusing
@@ -137,7 +138,7 @@ def _raw_imus(messages: dict[str, Messages], remarks: Remarks) -> dict[str, Imu]
         gyro_ns, rates, accel_ns, forces = columns
         topic = f"/imu{number}/raw"
         try:
-            imus[topic], notes = joined(gyro_ns, rates, accel_ns, forces, topic)
+            imus[topic], _, notes = joined(gyro_ns, rates, accel_ns, forces, topic)
         except DataError as error:
             remarks.losses.append(f"{topic} is left out: {error.what}")
         else:
