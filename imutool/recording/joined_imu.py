@@ -249,7 +249,12 @@ def joined(
 
 
 def _in_rows(
-    t_ns: Int64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"], name: str, *, spread: bool
+    t_ns: Int64[np.ndarray, " n"],
+    gyro: Float64[np.ndarray, "n 3"],
+    accel: Float64[np.ndarray, "n 3"],
+    name: str,
+    *,
+    spread: bool,
 ) -> JoinedSamples | None:
     """IMU of rows with both sensors; None where many rows have one of them alone."""
     has_gyro, has_accel = (np.isfinite(values).all(axis=1) for values in (gyro, accel))

@@ -1,9 +1,9 @@
 """Samples in the order of time; those of one stamp are spread at the sensor's rate.
 
 A phone or a driver stamps on arrival, often in whole milliseconds, so that several samples have one stamp. The first of n
-samples with a stamp T keeps it, and sample k goes to T + k s with s = (T' - T) / n, where T' is the next stamp. If the steps are
-clearly more even then, all end at T instead, with s from the stamp before: such samples came late. Next to a gap s is the
-median of the steps near it, so that a gap stays one. A sample that is alone with its stamp keeps it.
+samples with a stamp T keeps it, and sample k goes to T + k s with s = (T' - T) / n, where T' is the next stamp. If the steps
+are clearly more even then, all end at T instead, with s from the stamp before: such samples came late. Next to a gap s is
+the median of the steps near it, so that a gap stays one. A sample that is alone with its stamp keeps it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imutool.array_types import Bool, Float64, Int64
-from imutool.recording.columns import clock_jumps
+from imutool.recording.columns import clock_jumps, median
 
 MOST_SET_BACK = 0.01  # share of samples that a clock which was set back may cost; of more they are several recordings
 GAP_STEPS = 1.5  # median steps: a longer step holds a gap
@@ -70,14 +70,14 @@ def _is_fresh(t_ns: Int64[np.ndarray, " n"], begins: Bool[np.ndarray, " n"]) -> 
 
 
 def spread_stamps(t_ns: Int64[np.ndarray, " n"], starts: Int64[np.ndarray, " s"]) -> tuple[Int64[np.ndarray, " n"], bool]:
-    """Stamps of which each is one sample's, from stamps in order; and whether they were spread to the stamp before.
+    """Stamps of which each is one sample's, and whether they were spread to the stamp before.
 
-    `starts` are the rows in which the stamp changes, the first among them.
+    The stamps are in order. `starts` are the rows in which the stamp changes, the first among them.
     """
     count = np.diff(starts, append=len(t_ns))
     steps = np.diff(t_ns[starts]).astype(np.float64)
     usual = steps / count[:-1]
-    usual = np.concatenate([np.full(len(part), np.median(part)) for part in np.array_split(usual, -(-len(usual) // NEAR))])
+    usual = np.concatenate([np.full(len(part), median(part)) for part in np.array_split(usual, -(-len(usual) // NEAR))])
     usual = np.append(usual, usual[-1])
     each, behind = np.repeat(count, count), np.arange(len(t_ns)) - np.repeat(starts, count)
 
@@ -105,13 +105,16 @@ def _is_repeated(
     count = np.diff(starts, append=len(values))
     stamp = np.repeat(np.arange(len(starts)), count)
     shared = np.flatnonzero(np.repeat(count > 1, count))[:: -1 if keep_last else 1]
-    order = shared[np.lexsort((*values[shared].T, stamp[shared]))]
+    weighed = np.zeros(len(shared))  # equal rows have equal sums: to sort by one number takes a third of the time
+    for place, column in enumerate(values.T):
+        weighed += column[shared] * np.sqrt(place + 2.0)
+    order = shared[np.lexsort((weighed, stamp[shared]))]
     again = (np.diff(stamp[order]) == 0) & (np.diff(values[order], axis=0) == 0.0).all(axis=1)
     repeated = np.zeros(len(values), bool)
     repeated[order[1:][again]] = True
     sizes = count[count > 1]
     repeats = np.add.reduceat(repeated, starts)
-    usual = int(np.median(sizes))
+    usual = int(median(sizes))
     if ((sizes == usual) & (repeats[count > 1] == 0)).mean() > MOST_ALIKE:
         repeated[np.repeat(count == usual, count)] = False
     return repeated
@@ -122,10 +125,9 @@ def _spread_notes(moved_ns: Int64[np.ndarray, " n"], is_back: bool) -> list[str]
     if not moved_ns.any():
         return []
     way = "earlier than recorded, which makes the steps most even" if is_back else "later than recorded"
-    return [
-        f"{np.count_nonzero(moved_ns)} of {len(moved_ns)} samples share the stamp of another one: they are spread evenly, by up "
-        f"to {np.abs(moved_ns).max() * 1e-6:.6g} ms {way}; imutool convert LOG OUT --restamp puts all on a line"
-    ]
+    said = f"{np.count_nonzero(moved_ns)} of {len(moved_ns)} samples share the stamp of another one: they are spread evenly"
+    most_ms = np.abs(moved_ns).max() * 1e-6
+    return [f"{said}, by up to {most_ms:.6g} ms {way}; imutool convert LOG OUT --restamp puts all on a line"]
 
 
 def lost_to_set_back(t_ns: Int64[np.ndarray, " n"], name: str) -> list[str]:

@@ -20,7 +20,7 @@ from imutool.recording import Imu, Recording
 
 MS, START_NS = 1_000_000, 1_700_000_000_000_000_000
 T_NS = START_NS + 10 * MS * np.arange(2000)
-VALUES = np.random.default_rng(4).normal(0.0, 1.0, (2000, 6)) + [0, 0, 0, 0, 0, 9.81]
+VALUES = np.random.default_rng(4).normal([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], 1.0, (2000, 6))
 
 
 def logged(path: Path, stamps: np.ndarray, rows: np.ndarray | None = None) -> Path:
