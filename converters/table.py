@@ -168,7 +168,8 @@ def _mapped(columns: Columns, given: Entries, place: Path) -> list[TableMap]:
     unnamed = {TRUTH_GROUP, POSES_GROUP} & columns.sources.keys() and not given.keys() & {"truth_file", *TRUE_ENTRIES}
     if is_whole(given) and not unnamed:  # poses of another table that it does not name are found by the motion
         return [msgspec.convert(given, TableMap)]
-    if not {"gyro_unit", "accel_unit"} <= given.keys() or given.keys() & {"gyro", "accel"}:
+    has_units = {"gyro_unit", "accel_unit"} <= given.keys() and given.keys() & {"time_unit", "rate_hz"}
+    if not has_units or given.keys() & {"gyro", "accel"}:
         return []
     named = {topic: propose(part).entries for topic, part in imus_apart(columns).items()}
     own = ("gyro", "accel") if given.keys() & {"time", "rate_hz"} else ("gyro", "accel", "time")
@@ -285,8 +286,7 @@ def _further(
     notes = (f"{clock} stays apart from the IMU's clock: {', '.join(names[:20])}" for clock, names in apart.items())
     columns.remarks.notes.extend(notes)
     if left:
-        said = "columns of another length than the IMU's, without a time, are left out"
-        columns.remarks.losses.append(f"{said}: {', '.join(left[:20])}")
+        columns.remarks.losses.append(f"columns of another length, without a time, are left out: {', '.join(left[:20])}")
     if (over := len(clocks) - MOST_SCALARS) > 0:
         columns.remarks.losses.append(f"the table has {len(clocks)} further columns: {over} of them are left out")
     scalars = {}
