@@ -113,7 +113,9 @@ def test_states_and_labels_of_one_device_make_no_kinds_of_rows(tmp_path, flags):
 
 
 @pytest.mark.parametrize(
-    "further", [{}, {"time_unit": "ms"}, {"rate_hz": 100.0}, {"gyro_scale": 0.5}], ids=["units", "time_unit", "rate_hz", "scale"]
+    "further",
+    [{}, {"time_unit": "ms"}, {"rate_hz": 100.0}, {"gyro_scale": 0.5}],
+    ids=["units", "time_unit", "rate_hz", "scale"],
 )
 def test_stated_units_hold_for_each_of_several_imus(tmp_path, further):
     """Both units without that of the time ended in KeyError: ''."""
