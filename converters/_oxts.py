@@ -12,8 +12,8 @@ from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses, Scalars
-from imutool.recording.joined_imu import in_order
 from imutool.recording.message_log import Remarks
+from imutool.recording.sample_order import in_order
 
 OXTS = re.compile(r"(.*/)?oxts/data/\d+\.txt")
 TIMES = "oxts/timestamps.txt"

@@ -17,12 +17,14 @@ from ._table_times import (
     counters_of,
     counts_others,
     goes_on,
+    in_batches,
     rate_of_rows,
     rises,
     said_steps,
     share_skipped,
     stated_rate,
     units_of_time,
+    usual_step,
 )
 from ._table_units import TIME_NS
 
@@ -63,6 +65,9 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
         measured = {*counters, *gyro, *proposal.unsigned("accel", columns)}
         why, found = _unnamed_time(names, columns, counters, [c for c in names if c not in measured], length)
         proposal.reasons += [f"{column!r} {why}: it counts as the time" for column in found]
+    if not found and (found := [c for c in still if in_batches(columns.values[c])][:1]):
+        several = len(columns.values[found[0]]) / len(np.unique(columns.values[found[0]]))
+        proposal.reasons.append(f"{found[0]!r} has a stamp for {several:.3g} rows each in the mean")
     if not found:
         proposal.reasons += [f"{c!r} rises and has {len(columns.values[c])} rows, and the gyro {length}" for c in others]
         for column in still:
@@ -132,7 +137,7 @@ def _propose_time_unit(proposal: Proposal, column: str, names: dict[str, tuple[s
         proposal.entries["time_unit"] = unit
         return
     values = columns.values[column].astype(float)
-    step = float(np.nanmedian(np.diff(values)))
+    step = usual_step(values)
     if re.fullmatch(rf"(.*_)?{XSENS_TIME}", name):
         counts = "100us" if step * TIME_NS["100us"] <= 1e9 / PLAUSIBLE_HZ[0] else "us"
         proposal.entries["time_unit"] = counts

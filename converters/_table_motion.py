@@ -89,7 +89,7 @@ def _rows(
         return None
     t_ns = np.rint((t[:, 0] - t[0, 0]) * TIME_NS[str(proposal.entries["time_unit"])]).astype(np.int64)
     try:
-        imu, _ = joined(t_ns, gyro, t_ns, accel, "")  # rows may hold one of the two
+        imu = joined(t_ns, gyro, t_ns, accel, "").imu  # rows may hold one of the two
     except DataError:
         return None
     return (imu.t_ns, imu.gyro, imu.accel) if len(imu) else None

@@ -26,6 +26,8 @@ PERIOD = rf"(({OF})_?)*(dt|delta_?t|period|interval)|sampl(e|ing)_?time"
 PERIOD_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 COUNTER = r"packet|count|index|seq|frame|sample(?![ _]?time)"  # in the name of a column that counts
 FEWEST_STAMPS = 3  # that change, for the rate of the rows that share them
+FEWEST_BATCHES = 8  # that show how many rows have one stamp
+ROWS_APART, ROWS_ALIKE = 0.5, 0.8  # most by which the rows of a stamp differ from the usual number, and the share that does not
 MOST_STEP = 4.0  # of a counter; a column of larger steps may be a clock
 MOST_SKIPPED = 0.1  # share of a counter's steps that lost samples make longer; more may be packets of other sensors
 MOST_ODD = 0.01  # share of its steps that are no multiple of the usual one
@@ -98,6 +100,25 @@ def goes_on(values: np.ndarray) -> bool:
     """Whether a column named as a time is one: rounded, it may stand still, but not go back."""
     steps = np.diff(values.astype(float))
     return rises(values) or (len(steps) > 0 and float(np.mean(steps > 0)) > 0.5 and float(np.mean(steps >= 0)) > 0.99)
+
+
+def in_batches(values: np.ndarray) -> bool:
+    """Whether a time stands still and rises by turns, with about as many rows for each stamp."""
+    steps = np.diff(values.astype(float))
+    rows = np.diff(np.flatnonzero(steps != 0))
+    if len(rows) < FEWEST_BATCHES or float(np.mean(steps >= 0)) <= 0.99:
+        return False
+    return float(np.mean(np.abs(rows / np.median(rows) - 1.0) <= ROWS_APART)) >= ROWS_ALIKE
+
+
+def usual_step(values: np.ndarray) -> float:
+    """Usual step of a time from row to row, also where several rows have one stamp."""
+    values = values.astype(float)
+    median = float(np.nanmedian(np.diff(values)))
+    if median != 0.0 or not in_batches(values):
+        return median
+    starts = np.flatnonzero(np.diff(values)) + 1
+    return float(np.median(np.diff(values[starts])) / np.median(np.diff(starts)))
 
 
 def stated_rate(columns: Columns, gyro: str) -> tuple[str, float] | None:

@@ -1,4 +1,4 @@
-"""ArduPilot DataFlash (.bin, .log): IMUs in FLU, EKF poses as an estimate, every message.
+"""ArduPilot DataFlash (.bin, .log): IMUs in FLU with their temperatures, EKF poses as an estimate, every message.
 
 The log describes its own messages (FMT), in binary or as text with a message a line; no library is needed. ArduPilot measures
 in FRD and its world is NED: the IMU and pose topics are written in FLU and ENU, the other topics keep its own frames. Stamps
@@ -16,9 +16,10 @@ import numpy as np
 
 from imutool.errors import DataError
 from imutool.geometry import quaternion
-from imutool.recording import Imu, Poses
-from imutool.recording.joined_imu import in_order, joined
+from imutool.recording import Imu, Poses, Scalars
+from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import MessageLog, Remarks, Table
+from imutool.recording.sample_order import in_order
 
 from . import Sequence
 from ._archive import refusing
@@ -27,6 +28,7 @@ from ._source import find_files
 from .ulog import FLU_FROM_FRD, Q_ENU_FROM_NED_WXYZ, Q_FRD_FROM_FLU_WXYZ
 
 GENERAL = True
+TEMPERATURES = "T", "Temp"  # of the sensor, in degrees Celsius; of older logs the second
 IMU_FIELDS = "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ"
 POSE_FIELDS = "PE", "PN", "PD", "VE", "VN", "VD", "Roll", "Pitch", "Yaw"
 US = 1000  # ns
@@ -67,6 +69,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         sequence.path.name,
         imus=_imus(messages, remarks),
         poses=poses,
+        scalars=_temperatures(messages),
         kinds=dict.fromkeys(poses, "estimate"),
         tables={f"/{name}": _table(name, group) for name, group in messages.items()},
         metadata=metadata,
@@ -122,6 +125,17 @@ def _imus(messages: dict[str, Messages], remarks: Remarks) -> dict[str, Imu]:
     return imus
 
 
+def _temperatures(messages: dict[str, Messages]) -> dict[str, Scalars]:
+    """Temperature of each IMU; none of one that measures none and writes zeros."""
+    found = {}
+    for number, group in sorted(_instances(messages, "IMU").items()):
+        field = next((name for name in TEMPERATURES if _are_numbers(group, (name,))), None)
+        if field is not None and group.rows[field].any():
+            kept = in_order(group.t_ns, group.rows[field].astype(float)[:, None], f"/imu{number}")
+            found[f"/imu{number}/temperature"] = Scalars(kept.t_ns, kept.values, "degC")
+    return found
+
+
 def _raw_imus(messages: dict[str, Messages], remarks: Remarks) -> dict[str, Imu]:
     """IMUs of raw samples (GYR and ACC), which a log holds on request, at the times when they were taken."""
     imus = {}
@@ -137,7 +151,7 @@ def _raw_imus(messages: dict[str, Messages], remarks: Remarks) -> dict[str, Imu]
         gyro_ns, rates, accel_ns, forces = columns
         topic = f"/imu{number}/raw"
         try:
-            imus[topic], notes = joined(gyro_ns, rates, accel_ns, forces, topic)
+            imus[topic], _, notes = joined(gyro_ns, rates, accel_ns, forces, topic)
         except DataError as error:
             remarks.losses.append(f"{topic} is left out: {error.what}")
         else:

@@ -19,8 +19,9 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
 from imutool.recording import Imu, Poses, Scalars
-from imutool.recording.joined_imu import in_order, joined, lost_to_set_back, unit_by_gravity
+from imutool.recording.joined_imu import joined, unit_by_gravity
 from imutool.recording.message_log import MessageLog, Remarks
+from imutool.recording.sample_order import in_order, lost_to_set_back
 
 from . import Sequence
 from ._archive import list_members, read_bounded, refusing
@@ -162,7 +163,7 @@ def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str,
         accel = -accel
         remarks.notes.append("the phone is of Apple, whose accelerometer reads -g upwards: its sign was turned")
     remarks.notes.append(f"gyro from {tables[gyro_table]}, accel from {' + '.join(tables[table] for table in used)}")
-    imu, notes = joined(gyro_ns, gyro, accel_ns, accel, IMU_TOPIC)
+    imu, _, notes = joined(gyro_ns, gyro, accel_ns, accel, IMU_TOPIC)
     remarks.notes.extend(notes)
     imu = _in_rad_s(imu, _stated_unit(files, tables[gyro_table]), remarks)
     scalars: dict[str, Scalars] = {}

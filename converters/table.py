@@ -17,8 +17,9 @@ from imutool.array_types import Float64, Int64
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses, Scalars, unit_quaternions
-from imutool.recording.joined_imu import in_order, joined, lost_to_set_back
+from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import MessageLog, Remarks
+from imutool.recording.sample_order import in_order, lost_to_set_back
 
 from . import Sequence, _unpacking
 from ._source import head, name
@@ -101,8 +102,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
     poses = _truth(columns, table, path, place, remarks)
     group = next((g for g in (POSES_GROUP, TRUTH_GROUP) if g in columns.sources), "") if path.is_dir() else ""
     if not poses and (group or "pose_kind" in given):
-        file = columns.sources.get(group, path.name)
-        remarks.losses.append(f"{file} gives no poses: {why_no_poses(columns, group)}")
+        remarks.losses.append(f"{columns.sources.get(group, path.name)} gives no poses: {why_no_poses(columns, group)}")
     if poses and not table.truth_file:
         turns = *table.quaternion_wxyz, *table.roll_pitch_yaw, *matrix_columns(table.rotation_matrix)
         used |= {table.truth_time, *table.position, *turns}
@@ -168,7 +168,8 @@ def _mapped(columns: Columns, given: Entries, place: Path) -> list[TableMap]:
     unnamed = {TRUTH_GROUP, POSES_GROUP} & columns.sources.keys() and not given.keys() & {"truth_file", *TRUE_ENTRIES}
     if is_whole(given) and not unnamed:  # poses of another table that it does not name are found by the motion
         return [msgspec.convert(given, TableMap)]
-    if not {"gyro_unit", "accel_unit"} <= given.keys() or given.keys() & {"gyro", "accel"}:
+    has_units = {"gyro_unit", "accel_unit"} <= given.keys() and given.keys() & {"time_unit", "rate_hz"}
+    if not has_units or given.keys() & {"gyro", "accel"}:
         return []
     named = {topic: propose(part).entries for topic, part in imus_apart(columns).items()}
     own = ("gyro", "accel") if given.keys() & {"time", "rate_hz"} else ("gyro", "accel", "time")
@@ -216,7 +217,7 @@ def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
     for label, t_ns, values in (("gyro", gyro_ns, gyro), ("accel", accel_ns, accel)):
         if len(t_ns) != len(values):
             raise ConfigError(f"the {label} has {len(values)} rows and its time {len(t_ns)}", where=place, expected="as many")
-    imu, notes = joined(gyro_ns, gyro, accel_ns, accel, table.topic)
+    imu, _, notes = joined(gyro_ns, gyro, accel_ns, accel, table.topic)
     columns.remarks.notes.extend(notes)
     columns.remarks.losses.extend(lost_to_set_back(gyro_ns, table.topic))
     columns.remarks.doubt([f"{table.topic}: {each}" for each in unit_doubts(imu, table.gyro_unit, table.accel_unit)])
@@ -285,8 +286,7 @@ def _further(
     notes = (f"{clock} stays apart from the IMU's clock: {', '.join(names[:20])}" for clock, names in apart.items())
     columns.remarks.notes.extend(notes)
     if left:
-        said = "columns of another length than the IMU's, without a time, are left out"
-        columns.remarks.losses.append(f"{said}: {', '.join(left[:20])}")
+        columns.remarks.losses.append(f"columns of another length, without a time, are left out: {', '.join(left[:20])}")
     if (over := len(clocks) - MOST_SCALARS) > 0:
         columns.remarks.losses.append(f"the table has {len(clocks)} further columns: {over} of them are left out")
     scalars = {}

@@ -24,8 +24,9 @@ from imutool.array_types import Float64, Int64
 from imutool.errors import DataError, required
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses
-from imutool.recording.joined_imu import in_order, joined
+from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import MessageLog, Remarks, Table
+from imutool.recording.sample_order import in_order
 
 from . import Sequence
 from ._source import find_files, head
@@ -193,7 +194,7 @@ def _imus(topics: dict[str, Columns], remarks: Remarks) -> dict[str, Imu]:
 def _put(imus: dict[str, Imu], topic: str, found: Callable[[], tuple[Any, Any, Any, Any] | None], remarks: Remarks) -> None:
     try:
         if (columns := found()) is not None:
-            imus[topic], notes = joined(*columns, name=topic)
+            imus[topic], _, notes = joined(*columns, name=topic)
             remarks.notes.extend(notes)
     except DataError as error:
         remarks.losses.append(f"{topic} is left out: {error.what}")

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imutool.recording.joined_imu import in_order, joined, sensor_delay, unit_by_gravity
+from imutool.recording.joined_imu import joined, sensor_delay, unit_by_gravity
+from imutool.recording.sample_order import in_order
 
 RNG = np.random.default_rng(11)
 DURATION_S = 60.0
@@ -92,8 +93,9 @@ def test_of_one_clock_a_sample_that_one_sensor_lacks_is_left_out_and_nothing_is_
     accel = accel[: len(gyro_ns)].copy()
     gyro_ns, gyro = gyro_ns[: len(accel)], gyro[: len(accel)].copy()
     gyro[50], accel[70] = np.nan, np.nan
-    imu, notes = joined(gyro_ns, gyro, gyro_ns.copy(), accel, "/imu0")
+    imu, rows, notes = joined(gyro_ns, gyro, gyro_ns.copy(), accel, "/imu0")
     kept = np.delete(np.arange(len(gyro)), [50, 70])
+    assert np.array_equal(rows, kept)
     assert np.array_equal(imu.t_ns, gyro_ns[kept])
     assert np.array_equal(imu.gyro, gyro[kept])
     assert np.array_equal(imu.accel, accel[kept])
@@ -108,11 +110,11 @@ def test_a_clock_that_is_set_back_is_said_with_what_is_missing():
     assert in_order(t_ns, values, "imu").notes == []
     late = t_ns.copy()
     late[500] -= 2_000_000_000  # one stamp alone
-    assert in_order(late, values, "imu").notes == ["imu: 1 samples whose stamp repeats or goes back are left out"]
+    assert in_order(late, values, "imu").notes == ["imu: 1 samples whose stamp goes back are left out"]
     back = np.concatenate([t_ns[:600], t_ns[600:] - 2_000_000_000])
     found = in_order(back, values, "imu")
     assert len(found.t_ns) == 800
     assert found.notes == [
-        "imu: 200 samples whose stamp repeats or goes back are left out",
+        "imu: 200 samples whose stamp goes back are left out",
         "imu: the clock was set back by 1.99 s: that much of the motion is missing there",
     ]

@@ -17,6 +17,7 @@ import numpy as np
 
 from imutool.array_types import Bool, Float64, Int64
 from imutool.recording import nanoseconds
+from imutool.recording.sample_order import spread_stamps
 
 WINDOW = 256  # samples, several batches of any driver; a cheap sensor's rate wanders within seconds
 GAP_NS = nanoseconds(0.5)  # no longer step says anything of the period
@@ -198,8 +199,9 @@ def restamped(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
     found = read_stamps(stamp_ns)
     whole, steps = found.stamp_ns, np.diff(found.stamp_ns)
     near = steps[(steps >= 0) & (steps < GAP_NS)]
-    if not len(near):
-        return whole
+    if not near.any():  # as in whole seconds
+        starts = np.flatnonzero(np.diff(whole, prepend=whole[:1] - 1))
+        return spread_stamps(whole, starts)[0] if len(starts) > 1 and (steps >= 0).all() else whole
     is_batched = found.batch > 1.0
     batch_ns = found.batch * float(near.mean()) if is_batched else usual_period(whole)
     back = np.flatnonzero(steps < -GAP_NS) + 1

@@ -161,6 +161,8 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
         if "time" in imu:
             why = f"not {', '.join(imu['other_times'])}" if imu["other_times"] else WITHOUT_STAMP
             rows.append((imu["topic"], "time of the samples", f"{imu['time']}, {why}"))
+        stated = [imu["stated_units"]] if "stated_units" in imu else []
+        rows += [(imu["topic"], "units", f"{units}, by the comments of its definition") for units in stated]
         if imu["rate_hz"] is not None:
             clock = f"{imu['rate_hz']:.2f} Hz, jitter {1e3 * imu['jitter_s']:.3f} ms, longest gap {imu['largest_gap_s']:.3f} s"
             rows.append((imu["topic"], "clock of stamps", clock))

@@ -16,8 +16,10 @@ from typing import TypeVar
 import numpy as np
 
 from imutool.array_types import Float64
+from imutool.cleaning.pose_delay import lateness
 from imutool.conversion.corrections import NOT_TURNED, Corrections, pose_notes
 from imutool.geometry import quaternion
+from imutool.log_info.pose_clock import contradicts_delay
 from imutool.log_info.pose_imu_rotation import Body, body_of, frames_of_copies
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
@@ -113,13 +115,24 @@ def fitted_to(path: Path, common: Corrections) -> Corrections | None:
         notes = dict.fromkeys(common.imus, f"units and axes are now {SAID}")
         if not common.pose_topic:
             return replace(common, reflected=own_types, notes=notes)
+        kept = list[str]()
+        if (
+            common.late_ns
+            and log.imu_topics
+            and contradicts_delay(log, log.imu_topics[0], common.pose_topic, common.late_ns * 1e-9)
+        ):
+            said = lateness(common.late_ns * 1e-9)
+            kept.append(
+                f"{common.pose_topic} keeps its clock: in the other logs it is {said}, which its own motion contradicts"
+            )
+            common = replace(common, late_ns=0)
         turned = None if _is_identity(common.body.turn) else body_of(log, common.pose_topic, common.body.turn)
         frame_id = next(log.pose_batches(common.pose_topic)).frame_id
         copies = frames_of_copies(log, common.pose_topic)
     if said := pose_notes(common.world, common.quaternions, common.unit, common.late_ns, turned):
         notes[common.pose_topic] = f"{SAID}, {'; '.join(said)}"
     body = turned or NOT_TURNED
-    return replace(common, frame_id=frame_id, body=body, copies=copies, reflected=own_types, notes=notes)
+    return replace(common, frame_id=frame_id, body=body, copies=copies, reflected=own_types, notes=notes, kept=kept)
 
 
 def _is_corrected(topic: Topic) -> bool:

@@ -120,9 +120,11 @@ def write_corrected(
     refuse_existing(target, overwrite=overwrite)
     first = None if common is None else fitted_to(log, common)
     rounds, kept = ([], []) if first is None else _rounds(log, wanted, _with_stamps(first, log, wanted))
+    refused = [] if first is None else first.kept
     if not rounds or not all(found.is_of_clock for found in rounds[1:]):
+        refused = [] if rounds else refused
         rounds, kept = _rounds(log, wanted)
-    kept += _unjudged_poses(log)
+    kept = [*dict.fromkeys([*refused, *kept]), *_unjudged_poses(log)]
     if not rounds:
         log.replace(target)
         return (*kept,) or ("the motion shows nothing to correct",), Corrections()

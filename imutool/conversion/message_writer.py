@@ -15,6 +15,7 @@ import numpy as np
 
 import imutool
 from imutool.array_types import Shaped, UInt8
+from imutool.conversion.restamping import SharedStamps
 from imutool.conversion.robot_messages import Paths, Px4, pose_kind, px4_of
 from imutool.conversion.sensor_pairs import SensorPairs
 from imutool.conversion.user_labels import check_kinds
@@ -49,8 +50,6 @@ ROS_NAMES = {"f4": "float32", "f8": "float64", "b1": "bool"} | {
 LATEST_NS = 2**63 - 1  # of 64 bits with a sign, as numpy counts
 MOST_JUMPS = 1000  # of the clock, that are counted
 ENCAPSULATION = 4  # bytes ahead of a CDR message; alignment counts from behind them
-
-
 _encode_body = partial(encode_imu, frame_id=BODY)
 
 
@@ -148,7 +147,7 @@ class _Stream:
 
     def chunks(self) -> Iterator[tuple[Chunk, str | None]]:
         """Chunks of about 1 MiB as they fill, and the rest at the end."""
-        last, longest, jumps = None, nanoseconds(MOST_GAP_S), list[tuple[int, float]]()
+        last, longest, jumps, stamps = None, nanoseconds(MOST_GAP_S), list[tuple[int, float]](), SharedStamps()
         for topic, log_time, publish_time, payload in self._source.messages():
             if (number := self.channels.get(topic)) is None:
                 number = self._define(topic, payload)
@@ -158,6 +157,7 @@ class _Stream:
                 jumps.append((log_time, (log_time - last) * 1e-9))
             last = log_time
             self._pairs.take(topic, log_time, payload)
+            stamps.take(topic, payload)
             self.paths.take(topic, payload)
             if number not in self._begun:
                 self._begin(number, topic)
@@ -169,7 +169,7 @@ class _Stream:
         for buffer in {id(b): b for b in (*self._shared, *self._buffers.values())}.values():
             if buffer.parts:
                 yield buffer.pop()
-        self._source.remarks.notes += jump_warnings(jumps)
+        self._source.remarks.notes += [*jump_warnings(jumps), *stamps.notes()]
         for topic, number in self.channels.items():
             self.counts[topic.name] += self._sequence[number]
         for name, count in self._lacking.items():

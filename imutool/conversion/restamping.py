@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import partial
 
@@ -15,8 +16,36 @@ from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch, ScalarBatch
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES, Topic
+from imutool.recording.message_log import MessageTopic
 
+STAMP = slice(4, 12)  # of a message that begins with a header: behind the encapsulation of CDR, or the sequence of ROS 1
 SAME_CLOCK_NS = 10**9  # most by which a topic may come into the log later than the IMU
+
+
+class SharedStamps:
+    """Count of an IMU's messages that have the stamp of the one before, and other values."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, bytes] = {}
+        self._shared, self._all = Counter[str](), Counter[str]()
+
+    def take(self, topic: MessageTopic, payload: bytes | memoryview) -> None:
+        """Take in a message, if it is one of an IMU."""
+        if schemas.canonical(topic.schema_name) == schemas.IMU and topic.message_encoding in ENCODINGS:
+            raw, last = bytes(payload[STAMP.start :]), self._last.get(topic.name, b"")
+            size = STAMP.stop - STAMP.start
+            self._shared[topic.name] += raw[:size] == last[:size] and raw != last
+            self._all[topic.name] += 1
+            self._last[topic.name] = raw
+
+    def notes(self) -> Iterator[str]:
+        """Sentence on each topic with such messages."""
+        for name, count in self._shared.items():
+            if 0 < count == self._all[name] - 1:
+                yield f"{name}: the stamps were never set; imutool convert LOG OUT --restamp takes the log times"
+            elif count:
+                said = f"{count} of {self._all[name]} messages have the stamp of the one before, and other values"
+                yield f"{name}: {said}; imutool convert LOG OUT --restamp spreads them at the sensor's rate"
 
 
 def find_stamps(log: Log, notes: Mapping[str, list[str]]) -> dict[str, Int64[np.ndarray, "..."]]:

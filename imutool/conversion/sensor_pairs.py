@@ -97,14 +97,13 @@ class SensorPairs:
             log_times, gyro_ns, gyro, _ = self._samples(gyro_topic)
             _, accel_ns, _, accel = self._samples(accel_topic)
             try:
-                imu, notes = joined(gyro_ns, gyro, accel_ns, accel, whole)
+                imu, rows, notes = joined(gyro_ns, gyro, accel_ns, accel, whole)
             except DataError as error:
                 remarks.losses.append(f"{gyro_topic} and {accel_topic} give no IMU: {error.what}")
                 continue
             axes = ", in FLU" if gyro_topic in self._px4 else ""
             remarks.notes += [f"{whole} is made of {gyro_topic} and {accel_topic}{axes}", *notes]
-            stamps, first = np.unique(gyro_ns, return_index=True)  # of a stamp that repeats the first sample was taken
-            yield whole, LoggedImu(log_times[first[np.searchsorted(stamps, imu.t_ns)]], imu)
+            yield whole, LoggedImu(log_times[rows], imu)
 
     def _samples(
         self, topic: str

@@ -164,6 +164,7 @@ def _imu(
         derived_from=derived_from,
         time=used,
         other_times=others,
+        stated_units=topic.reflected.units or UNSET if isinstance(topic.reflected, Reflected) else UNSET,
         samples=imu.recorded.count,
         **imu.recorded.clock()._asdict(),
         **imu.counts,

@@ -68,7 +68,7 @@ class ImuInfo(Section, frozen=True, kw_only=True):
 
     `time` is the field that stamps the samples and `other_times` those that do not, where the message holds several; it is `log
     time` where the message holds none.
-    Only warnings where its encoding is unknown.
+    `stated_units` are those that the comments of a driver's own definition state. Only warnings where its encoding is unknown.
     """
 
     topic: str
@@ -76,6 +76,7 @@ class ImuInfo(Section, frozen=True, kw_only=True):
     derived_from: str | UnsetType = UNSET
     time: str | UnsetType = UNSET
     other_times: list[str] | UnsetType = UNSET
+    stated_units: str | UnsetType = UNSET
     samples: int | UnsetType = UNSET
     rate_hz: float | UnsetType | None = UNSET
     jitter_s: float | UnsetType | None = UNSET

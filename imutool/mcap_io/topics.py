@@ -287,7 +287,7 @@ def joined_topic(gyro: Topic, accel: Topic, rows: Callable[[str], Iterator[Rows]
     gyro_ns, rates = _column(gyro.vectors(found, "gyro") for found in rows(gyro.name))
     accel_ns, forces = _column(accel.vectors(found, "accel") for found in rows(accel.name))
     name = whole_of((gyro.name, accel.name))
-    imu, notes = joined(gyro_ns, rates, accel_ns, forces, name)
+    imu, _, notes = joined(gyro_ns, rates, accel_ns, forces, name, spread=False)  # the messages keep their stamps
     message = JoinedImu(gyro.cut, partial(gyro.vectors, sensor="gyro"), imu.t_ns, imu.accel)
     encoding = gyro.message_encoding if gyro.message_encoding in ENCODINGS else "cdr"
     return Topic(name, schemas.IMU, "ros2msg", encoding, len(imu), {}, message, gyro_topic=gyro.name), notes

@@ -7,7 +7,6 @@ which both sides correlate best.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +15,8 @@ from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording import Imu
-from imutool.recording.columns import clock_jumps, longest_run
+from imutool.recording.columns import longest_run
+from imutool.recording.sample_order import Cleaned, in_order
 
 STEP_S = 0.005
 SMOOTHED = 11  # steps; the same of both sensors, so that it adds no delay
@@ -188,42 +188,14 @@ SHOWN_STDS = 3.0  # standard deviations from which on a delay is told from none
 LEAST_COMMON = 0.9  # share of the stamps that sensors on one clock have in common
 LONGEST_ALONE_S = 1.0  # of the accelerometer before and after the gyro, as sensors that start one by one have
 MAX_GAP_PERIODS = 4.0  # of the accelerometer, across which nothing is interpolated
-MOST_SET_BACK = 0.01  # share of samples that a clock which was set back may cost; of more they are several recordings
 
 
-@dataclass
-class Cleaned:
-    """Samples in time order without repeated stamps and without values that are not finite."""
+class JoinedSamples(NamedTuple):
+    """IMU on the gyro's stamps, the places of its samples among the gyro's, and notes."""
 
-    t_ns: Int64[np.ndarray, " n"]
-    values: Float64[np.ndarray, "n k"]
-    notes: list[str] = field(default_factory=list)
-
-
-def in_order(t_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n k"], name: str) -> Cleaned:
-    """Samples whose stamps increase; notes say how many were left out, and why."""
-    finite = np.isfinite(values).all(axis=1)
-    later = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
-    fresh = np.concatenate([[True], t_ns[1:] > later[:-1]]) if len(t_ns) else np.zeros(0, bool)
-    notes = []
-    if not finite.all():
-        notes.append(f"{name}: {int((~finite).sum())} samples that are not finite are left out")
-    if (finite & ~fresh).any():
-        notes.append(f"{name}: {int((finite & ~fresh).sum())} samples whose stamp repeats or goes back are left out")
-    if back_s := [-step_s for _, step_s in clock_jumps(t_ns) if step_s < 0.0]:
-        notes.append(f"{name}: the clock was set back by {sum(back_s):.6g} s: that much of the motion is missing there")
-    keep = finite & fresh
-    return Cleaned(t_ns[keep], values[keep], notes)
-
-
-def lost_to_set_back(t_ns: Int64[np.ndarray, " n"], name: str) -> list[str]:
-    """Sentence on samples that have the times of others before them, where these are many."""
-    lost = int((t_ns[1:] <= np.maximum.accumulate(t_ns)[:-1]).sum())
-    if lost <= MOST_SET_BACK * len(t_ns) or all(step_s > 0.0 for _, step_s in clock_jumps(t_ns)):
-        return []
-    what = f"{name}: {lost} of {len(t_ns)} samples are left out, as their time goes back to that of samples before them"
-    fix = "give each a table of its own, or add a column `trial` that tells them apart"
-    return [f"{what}; if the table holds several recordings, {fix}"]
+    imu: Imu
+    rows: Int64[np.ndarray, " n"]
+    notes: list[str]
 
 
 def joined(
@@ -232,19 +204,24 @@ def joined(
     accel_ns: Int64[np.ndarray, " m"],
     accel: Float64[np.ndarray, "m 3"],
     name: str,
-) -> tuple[Imu, list[str]]:
-    """IMU on the gyro's stamps, with notes on what was interpolated and left out.
+    *,
+    spread: bool = True,
+) -> JoinedSamples:
+    """IMU on the gyro's stamps, with notes on what was interpolated, spread and left out.
 
     Raises:
         DataError: the two sensors share no time, or no sample of one is finite.
     """
-    rates, forces = in_order(gyro_ns, gyro, f"{name} gyro"), in_order(accel_ns, accel, f"{name} accel")
+    if np.array_equal(gyro_ns, accel_ns) and (whole := _in_rows(gyro_ns, gyro, accel, name, spread=spread)) is not None:
+        return whole
+    rates = in_order(gyro_ns, gyro, f"{name} gyro", spread=spread)
+    forces = in_order(accel_ns, accel, f"{name} accel", spread=spread)
     notes = rates.notes + forces.notes
     t_ns, first, second = np.intersect1d(rates.t_ns, forces.t_ns, assume_unique=True, return_indices=True)
     if len(t_ns) > LEAST_COMMON * max(len(rates.t_ns), len(forces.t_ns)):  # one clock: a sample that one of them lacks is none
         alone = len(rates.t_ns) + len(forces.t_ns) - 2 * len(t_ns)
         notes += [f"{name}: {alone} samples that gyro or accel alone has are left out"] if alone else []
-        return Imu(t_ns, rates.values[first], forces.values[second]), notes
+        return JoinedSamples(Imu(t_ns, rates.values[first], forces.values[second]), rates.rows[first], notes)
     for sensor, given, kept in (("gyro", gyro_ns, rates), ("accelerometer", accel_ns, forces)):
         if len(given) and not len(kept.t_ns):
             raise DataError(f"none of the {len(given)} samples of the {sensor} is finite", where=name, expected="numbers")
@@ -268,7 +245,28 @@ def joined(
     if (alone_s := alone.sum() / rate_hz[1]) > LONGEST_ALONE_S:
         said = f"{int(alone.sum())} accelerometer samples ({alone_s:.1f} s) before or after all of the gyro's are left out"
         notes.append(f"{name}: {said}: are both of one recording?")
-    return Imu(rates.t_ns[inside], rates.values[inside], accel_there), notes
+    return JoinedSamples(Imu(rates.t_ns[inside], rates.values[inside], accel_there), rates.rows[inside], notes)
+
+
+def _in_rows(
+    t_ns: Int64[np.ndarray, " n"],
+    gyro: Float64[np.ndarray, "n 3"],
+    accel: Float64[np.ndarray, "n 3"],
+    name: str,
+    *,
+    spread: bool,
+) -> JoinedSamples | None:
+    """IMU of rows with both sensors; None where many rows have one of them alone."""
+    has_gyro, has_accel = (np.isfinite(values).all(axis=1) for values in (gyro, accel))
+    both = np.flatnonzero(has_gyro & has_accel)
+    if len(both) <= LEAST_COMMON * max(has_gyro.sum(), has_accel.sum()):
+        return None
+    parts = (("gyro", has_gyro), ("accel", has_accel))
+    notes = [f"{name} {s}: {(~has).sum()} samples that are not finite are left out" for s, has in parts if not has.all()]
+    if alone := int((has_gyro != has_accel).sum()):
+        notes.append(f"{name}: {alone} samples that gyro or accel alone has are left out")
+    kept = in_order(t_ns[both], np.concatenate([gyro[both], accel[both]], axis=1), name, spread=spread)
+    return JoinedSamples(Imu(kept.t_ns, kept.values[:, :3], kept.values[:, 3:]), both[kept.rows], notes + kept.notes)
 
 
 def _delay_sentence(rates: Cleaned, forces: Cleaned) -> str:

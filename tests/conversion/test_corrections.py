@@ -218,6 +218,36 @@ def test_short_logs_are_corrected_as_the_others_of_their_setup_and_a_right_one_s
         np.testing.assert_allclose(fixed.p_wb, true.p_wb, atol=0.05, err_msg=name)
 
 
+def test_a_log_whose_poses_have_another_delay_does_not_get_that_of_the_others(tmp_path: Path) -> None:
+    """Seven seconds measure no delay, but they contradict one."""
+    made = flight(3, duration_s=40.0, rate_hz=100.0, truth_rate_hz=50.0)
+    start_ns = int(made.imu.t_ns[0])
+    logs = {  # ends in s, delay in ms, and whether that is taken off
+        "long_1": (0.0, 40.0, 80, True),
+        "long_2": (5.0, 35.0, 80, True),
+        "alike": (20.0, 27.0, 80, True),
+        "none": (20.0, 27.0, 0, False),
+        "late": (20.0, 27.0, 200, False),
+        "early": (20.0, 27.0, -60, False),
+        "right": (5.0, 35.0, 0, False),
+    }
+    (tmp_path / "in").mkdir()
+    for name, (first_s, last_s, late_ms, _) in logs.items():
+        ends_ns = [start_ns + round(s * 1e9) for s in (first_s, last_s)]
+        poses = made.truth.between(*ends_ns)
+        late = replace(poses, t_ns=poses.t_ns + late_ms * 1_000_000)
+        write(replace(made, imu=made.imu.between(*ends_ns), truths={"/vicon/pose": late}), tmp_path / "in" / f"{name}.mcap")
+    notes = convert(tmp_path / "in", tmp_path / "out", correct=["conventions"], workers=1).notes
+    for name, (_, _, late_ms, is_corrected) in logs.items():
+        before, after = (read(tmp_path / folder / f"{name}.mcap").truth.t_ns[0] for folder in ("in", "out"))
+        if is_corrected:
+            assert abs(before - after - late_ms * 1_000_000) < 5_000_000, name
+        else:
+            assert before == after, name
+            said = f"{name}.mcap: /vicon/pose keeps its clock: in the other logs it is 8"
+            assert any(note.startswith(said) and note.endswith("which its own motion contradicts") for note in notes), name
+
+
 def test_logs_share_what_most_of_those_that_show_anything_agree_on() -> None:
     degrees, turned = np.stack([np.radians(1.0) * np.eye(3), np.eye(3)]), np.stack([P, P])
     shows, shows_other, shows_nothing = Corrections({"/imu0": degrees}), Corrections({"/imu0": turned}), Corrections()

@@ -180,3 +180,24 @@ def test_what_a_log_with_texts_alone_on_a_topic_loses_to_a_cut_is_its_end(conver
     assert "500 on /imu0" in done.stdout, done.stderr
     with (tmp_path / "out.mcap").open("rb") as file:
         assert {m.data for _, c, m in make_reader(file).iter_messages() if c.topic in ("/MSG", "/STRT")} == {b"\0\1\0\0\0"}
+
+
+@pytest.mark.parametrize(("name", "older"), [("T", False), ("Temp", True)])
+def test_the_temperature_of_each_imu_is_a_topic(convert, tmp_path, name, older):
+    log = DataFlash()
+    names = ("IMU", "IMU2") if older else ("IMU", "IMU")
+    for kind, each in enumerate(dict.fromkeys(names)):
+        which = ("Q", "TimeUS,") if older else ("QB", "TimeUS,I,")
+        log.form(1 + kind, each, f"{which[0]}fffffff", f"{which[1]}GyrX,GyrY,GyrZ,AccX,AccY,AccZ,{name}")
+    for n in range(500):
+        for instance, each in enumerate(names):
+            own = () if older else (instance,)
+            log.add(each, 7_000_000 + 5000 * n, *own, 0.1, 0.2, 0.3, 1.0, 2.0, -9.75, (41.0 + 0.01 * n) * (1 - instance))
+    (tmp_path / "1.BIN").write_bytes(log.raw)
+    assert convert(tmp_path / "1.BIN", tmp_path / "out.mcap").returncode == 0
+    with Log(tmp_path / "out.mcap") as opened:
+        assert opened.imu_topics == ["/imu0", "/imu1"]
+        assert "/imu1/temperature" not in opened.topics  # it writes zeros
+    found = read(tmp_path / "out.mcap", imu="/imu0").scalars["/imu0/temperature"]
+    assert (found.unit, len(found.t_ns), found.t_ns[0]) == ("degC", 500, 7_000_000_000)
+    np.testing.assert_allclose(found.values[:, 0], 41.0 + 0.01 * np.arange(500), rtol=1e-6)

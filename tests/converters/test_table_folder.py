@@ -253,7 +253,8 @@ def test_a_rounded_time_is_a_time_and_an_open_unit_beside_a_counter_no_error(tmp
     t_s = np.floor(np.arange(COUNT) / 1.2) / 100.0  # every sixth stands twice
     (tmp_path / "log.csv").write_text(",".join(["time", *names]) + "\n" + rows(t_s, GYRO, ACCEL))
     imu = table.read_sequence(table.sequences(tmp_path / "log.csv")[0]).imus["/imu0"]
-    assert np.array_equal(imu.t_ns, np.unique(np.rint(t_s * 1e9).astype(np.int64)))
+    assert len(imu) == COUNT
+    assert np.abs(imu.t_ns * 1e-9 - t_s).max() < 0.0051
     text = ",".join(["n", *names]).replace("gyro_x [rad/s]", "gyro_x") + "\n" + rows(np.arange(COUNT), GYRO, ACCEL)
     (tmp_path / "log.csv").write_text(
         text.replace(".000000,", ",").replace("gyro_y [rad/s]", "gyro_y").replace("gyro_z [rad/s]", "gyro_z")

@@ -77,7 +77,7 @@ def test_a_json_document_of_samples_is_a_table(tmp_path, name, indent):
     assert np.array_equal(imu.t_ns - imu.t_ns[0], 10_000_000 * np.arange(COUNT))
 
 
-def test_batches_of_samples_are_rows_and_their_rate_is_proposed(tmp_path):
+def test_batches_of_samples_are_rows_spread_over_the_time_of_each(tmp_path):
     """A Movesense has a time for each batch alone."""
     sensors = {"ArrayAcc": ACCEL, "ArrayGyro": np.rad2deg(GYRO)}
     batches = [
@@ -89,15 +89,11 @@ def test_batches_of_samples_are_rows_and_their_rate_is_proposed(tmp_path):
     ]
     (tmp_path / "log.json").write_text(json.dumps({"Meas": {"IMU6": batches}}))
     (sequence,) = table.sequences(tmp_path / "log.json")
-    with pytest.raises(ConfigError, match="'Timestamp' is named as a time and does not rise") as refused:
-        table.read_sequence(sequence)
-    lines = refused.value.fix.split("\n\n", 1)[1].splitlines()
-    rate = next(line.removeprefix("# ") for line in lines if line.startswith("# rate_hz = 106.667  # in place of"))
-    answered = [line.replace('"?"', '"deg/s"', 1) for line in lines if not line.startswith("time")]
-    (tmp_path / "map.toml").write_text("\n".join([rate, *answered]))
-    imu = table.read_sequence(sequence, mapping=tmp_path / "map.toml").imus["/imu0"]
+    log = table.read_sequence(sequence, mapping={"gyro_unit": "deg/s"})
+    assert "'Timestamp' has a stamp for 8 rows each in the mean" in log.remarks.notes
+    imu = log.imus["/imu0"]
     np.testing.assert_allclose(np.hstack([imu.gyro, imu.accel]), np.hstack([GYRO, ACCEL]))
-    assert np.diff(imu.t_ns)[0] == pytest.approx(75e6 / 8, rel=1e-5)
+    assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 1, 9_375_000))
 
 
 def test_lists_a_line_are_a_table_without_a_header(tmp_path):

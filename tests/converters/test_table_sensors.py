@@ -110,3 +110,22 @@ def test_states_and_labels_of_one_device_make_no_kinds_of_rows(tmp_path, flags):
         state = flags[number // 20 % 2 if "run" in flags else number % 2]
         lines.append(row(",", 10 * number, state, *gyro, *accel))
     assert [len(imu) for imu in read(tmp_path / "one.csv", lines).imus.values()] == [COUNT]
+
+
+@pytest.mark.parametrize(
+    "further",
+    [{}, {"time_unit": "ms"}, {"rate_hz": 100.0}, {"gyro_scale": 0.5}],
+    ids=["units", "time_unit", "rate_hz", "scale"],
+)
+def test_stated_units_hold_for_each_of_several_imus(tmp_path, further):
+    """Both units without that of the time ended in KeyError: ''."""
+    axes = [f"{side}_{sensor}_{axis}" for side in ("left", "right") for sensor in ("gyro", "acc") for axis in "xyz"]
+    rows = [row(",", 10 * n, *gyro, *accel, *gyro, *accel) for n, (gyro, accel) in enumerate(zip(GYRO, ACCEL, strict=True))]
+    (tmp_path / "two.csv").write_text("\n".join([row(",", "time_ms", *axes), *rows]) + "\n")
+    mapping = {"gyro_unit": "deg/s", "accel_unit": "g", **further}
+    imus = table.read_sequence(table.sequences(tmp_path / "two.csv")[0], mapping=mapping).imus
+    assert [*imus] == ["/left/imu", "/right/imu"]
+    for imu in imus.values():
+        np.testing.assert_allclose(imu.gyro, np.deg2rad(GYRO) * further.get("gyro_scale", 1.0))
+        np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL)
+        assert np.array_equal(imu.t_ns, 10_000_000 * np.arange(COUNT))

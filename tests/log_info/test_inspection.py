@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import time
 import tracemalloc
 from dataclasses import replace
@@ -20,6 +21,7 @@ from imutool.converters import fetch, tum_vi
 from imutool.errors import LogError
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.codec.decode import decode_imu
+from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import GRAVITY_M_S2, Frames, Imu, Poses, Recording
 from imutool.report import json_values
@@ -356,6 +358,7 @@ def test_what_is_no_log_is_refused(tmp_path, content):
 
 
 WITHOUT_STAMP = "as the messages state no stamp with its unit"
+UNITS = {"gyro": "deg/s", "accel": "g"}
 
 
 @pytest.mark.parametrize(
@@ -385,3 +388,24 @@ def test_the_time_that_counts_is_named_if_a_message_leaves_it_open(tmp_path: Pat
     assert shown == ([f"{time}, {'not sensor_time_us' if others else WITHOUT_STAMP}"] if time else [])
     notes = convert(tmp_path / "a.mcap", tmp_path / "b.mcap").notes
     assert any(note.endswith(f"; at the log time, {WITHOUT_STAMP}") for note in notes) == (time == "log time")
+
+
+def test_units_in_the_comments_of_a_definition_are_named(tmp_path: Path) -> None:
+    """They were applied without a word."""
+    definition = "".join(f"float64 {sensor}_{axis} # {unit}\n" for sensor, unit in UNITS.items() for axis in "xyz")
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("my_driver/msg/Imu", "ros2msg", definition.encode())
+        imu = writer.register_channel("/imu", "cdr", schema)
+        for n in range(200):
+            t_ns = 1_700_000_000_000_000_000 + n * 5_000_000
+            data = b"\0\1\0\0" + struct.pack("<6d", 180.0, 0.0, 0.0, 0.0, 0.0, 1.0 + 1e-4 * (n % 2))
+            writer.add_message(imu, t_ns, data, t_ns)
+        writer.finish()
+    said = "gyro in deg/s, accel in g, by the comments of its definition"
+    assert f"b.mcap: /imu: {said}" in convert(tmp_path / "a.mcap", tmp_path / "b.mcap").notes
+    report = inspect(tmp_path / "b.mcap")
+    assert [value for _, name, value in imu_rows(report) if name == "units"] == [said]
+    assert json_values(report)["imu"][0]["stated_units"] == "gyro in deg/s, accel in g"
+    np.testing.assert_allclose(read(tmp_path / "b.mcap").imu.gyro[0], [np.pi, 0.0, 0.0])

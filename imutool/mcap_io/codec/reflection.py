@@ -37,14 +37,14 @@ FRAME = r"frame_?id|frame"
 PER_S = r"[ _]?(/|\bper\b) ?s(ec(ond)?s?)?\b"
 STATED = {  # units in the comments of a definition, with their size in SI
     "gyro": {
-        rf"\b(m|milli)(dps\b|deg(ree)?s?{PER_S})": np.pi / 180e3,
-        rf"(?<![a-z])(dps\b|deg(ree)?s?{PER_S})|°/s": np.pi / 180.0,
-        rf"\brad(ian)?s?{PER_S}|\brps\b": 1.0,
+        rf"\b(m|milli)(dps\b|deg(ree)?s?{PER_S})": ("mdeg/s", np.pi / 180e3),
+        rf"(?<![a-z])(dps\b|deg(ree)?s?{PER_S})|°/s": ("deg/s", np.pi / 180.0),
+        rf"\brad(ian)?s?{PER_S}|\brps\b": ("rad/s", 1.0),
     },
     "accel": {
-        r"m/s(\^|\*\*)?2|m/s²|m/s/s|\bmet(er|re)s? per sec(ond)?s?( squared|\^2|²)|\bmps2\b": 1.0,
-        r"\b(mg|milli-?g'?s?)\b": 9.80665e-3,
-        r"[\[(](in )?g'?s?[\])]|\bin g'?s?\b|^g'?s?$|\bunits?:? g\b": 9.80665,
+        r"m/s(\^|\*\*)?2|m/s²|m/s/s|\bmet(er|re)s? per sec(ond)?s?( squared|\^2|²)|\bmps2\b": ("m/s^2", 1.0),
+        r"\b(mg|milli-?g'?s?)\b": ("mg", 9.80665e-3),
+        r"[\[(](in )?g'?s?[\])]|\bin g'?s?\b|^g'?s?$|\bunits?:? g\b": ("g", 9.80665),
     },
 }
 LOG_TIME, WITHOUT_STAMP = "log time", "as the messages state no stamp with its unit"
@@ -70,6 +70,7 @@ class Reflected:
     covariances: tuple[Path | None, ...] = ()
     other_stamps: tuple[Path, ...] = ()  # further times in the message, which do not count
     sizes: tuple[float, float] = (1.0, 1.0)  # of the rates and the accelerations of an IMU in SI, as the definition states
+    units: str = ""  # that the comments of the definition state, in words
 
     def sample(self, raw: bytes, log_time: int) -> Sample:
         """Sample in a message; at its log time where it has no stamp.
@@ -227,15 +228,16 @@ def reflect_cdr(schema_name: str, schema: bytes) -> Reflected | None:
     if found is None:
         return None
     first = (form.comments(found.vectors[0]), STATED["gyro"]), (form.comments(found.vectors[3]), STATED["accel"])
-    gyro, accel = (_stated(comments, units) for comments, units in first)
-    return replace(found, sizes=(gyro, accel))
+    stated = dict(zip(STATED, (_stated(comments, units) for comments, units in first), strict=True))
+    said = ", ".join(f"{sensor} in {unit}" for sensor, (unit, _) in stated.items() if unit)
+    return replace(found, sizes=(stated["gyro"][1], stated["accel"][1]), units=said)
 
 
-def _stated(comments: Iterable[str], units: Mapping[str, float]) -> float:
-    """Size of the unit that the nearest comment states; 1 where none states one, or one states several."""
-    named = ([size for unit, size in units.items() if re.search(unit, text.lower())] for text in comments)
-    nearest = next(filter(None, named), [1.0])
-    return nearest[0] if len(nearest) == 1 else 1.0
+def _stated(comments: Iterable[str], units: Mapping[str, tuple[str, float]]) -> tuple[str, float]:
+    """Unit that the nearest comment states, and its size; no unit and 1 where none states one, or one states several."""
+    named = ([unit for pattern, unit in units.items() if re.search(pattern, text.lower())] for text in comments)
+    nearest = next(filter(None, named), [])
+    return nearest[0] if len(nearest) == 1 else ("", 1.0)
 
 
 def _found(tree: Tree, form: Format) -> Reflected | None:
