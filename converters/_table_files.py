@@ -15,20 +15,22 @@ from imutool.errors import DataError, required
 from ._archive import refusing
 from ._source import head
 from ._table_echo import of_echo
+from ._table_hdf5 import load_hdf5
 from ._table_headerless import as_table, name_headerless
 from ._table_json import is_json, load_json
 from ._table_mat import check_size, load_mat
 from ._table_merged import join_stamps, sort_by_clock
 from ._table_mocap import is_mocap, read_mocap
-from ._table_names import is_of_recordings, is_of_sensors
+from ._table_names import tells_apart
 from ._table_numbers import is_number
 from ._table_packed import read_bytes, text_head
 from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated
 from ._table_sensors import read_rows
 from ._table_sheets import load_sheets
-from ._table_text import FIRSTS, WIDEST, Columns, is_text_table, no_numbers, read_csv, text_of
+from ._table_text import FIRSTS, WIDEST, Columns, is_text_table, read_csv, text_of
 from ._table_times import join_gps_weeks, read_serial_days
 
+OF_ARRAYS = "json", "npz", "mat", "hdf5", "sheets"  # kinds of files that hold tables or arrays of several lengths
 NO_NUMBERS = "holds no columns of numbers"
 MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own in HDF5
     "hdf5": b"\x89HDF\r\n\x1a\n",
@@ -64,8 +66,8 @@ def kind_of(head: bytes, path: Path) -> str:
     return "csv" if is_table else ""
 
 
-def load(path: Path, kind: str, sheet: str = "") -> Columns:
-    """Columns of a table file, of a spreadsheet those of one sheet or of all.
+def load(path: Path, kind: str) -> Columns:
+    """Columns of a table file.
 
     Raises:
         ConfigError: a library is missing; the extra is named.
@@ -73,10 +75,7 @@ def load(path: Path, kind: str, sheet: str = "") -> Columns:
     """
     columns = Columns()
     with refusing(path):
-        if kind == "sheets":
-            load_sheets(path, columns, read_text, sheet)
-        else:
-            LOADERS[kind](path, columns)
+        LOADERS[kind](path, columns)
     scale_stated(columns)
     join_stamps(columns)
     join_gps_weeks(columns)
@@ -88,13 +87,14 @@ def load(path: Path, kind: str, sheet: str = "") -> Columns:
     return columns
 
 
-def names_of(path: Path) -> list[str]:
-    """Names of the columns of a table of text, Parquet or Feather, by its first bytes.
+def may_hold_several(path: Path) -> bool:
+    """Whether a table may hold several recordings or sensors, by its kind or its columns' names."""
+    kind = kind_of(head(path), path)
+    return kind in OF_ARRAYS or any(map(tells_apart, _names_of(path, kind)))
 
-    Fields of further rows may be among them.
-    """
-    start = head(path)
-    kind = kind_of(start, path)
+
+def _names_of(path: Path, kind: str) -> list[str]:
+    """Names of the columns of a table of text, Parquet or Feather; fields of further rows may be among them."""
     if kind == "csv":
         lines = text_of(text_head(path)).splitlines()[:FIRSTS]
         return [field.strip(' "#') for line in lines for field in re.split(r"[;,\t]", line) if not is_number(field)]
@@ -164,14 +164,10 @@ def _load_feather(path: Path, columns: Columns) -> None:
 def _numbers_of(schema: Any, columns: Columns) -> list[str]:
     """Names of the fields that hold numbers or times; the others are losses."""
     numbers = [f.name for f in schema if re.match(r"u?int|float|double|halffloat|bool|timestamp|dict", str(f.type))]
-    words = [f.name for f in schema if re.match(r"large_string|string", str(f.type)) and _tells_apart(f.name)]
+    words = [f.name for f in schema if re.match(r"large_string|string", str(f.type)) and tells_apart(f.name)]
     others = [field for field in schema if field.name not in (*numbers, *words)]
     columns.remarks.losses.extend(f"{field.name} is left out: it is of type {field.type}, no number" for field in others)
     return numbers + words
-
-
-def _tells_apart(name: str) -> bool:
-    return is_of_recordings(name) or is_of_sensors(name)
 
 
 def _add_arrow(table: Any, columns: Columns) -> None:
@@ -180,8 +176,7 @@ def _add_arrow(table: Any, columns: Columns) -> None:
         if str(column.type).startswith("timestamp"):
             columns.add(f"{name} [ns]", column.cast("timestamp[ns]").cast("int64").to_numpy())
         elif "string" in str(column.type):
-            columns.labels[name] = texts = [str(text or "") for text in column.to_pylist()]
-            columns.remarks.losses.append(no_numbers(name, texts))
+            columns.add_labels(name, [str(text or "") for text in column.to_pylist()])
         else:
             columns.add(name, column.to_numpy())
 
@@ -234,46 +229,6 @@ def npy_shape(member: Any) -> tuple[int, ...]:
     return shape
 
 
-def _load_hdf5(path: Path, columns: Columns) -> None:
-    h5py = _module("h5py", path)
-
-    elsewhere: list[str] = []
-
-    def look(name: str, link: Any) -> None:  # external links are never followed
-        if isinstance(link, h5py.ExternalLink):
-            elsewhere.append(name)
-
-    def visit(name: str, node: Any) -> None:
-        for key, value in node.attrs.items():
-            if np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf":
-                columns.add(f"{name}/{key}", value)
-        if "MATLAB_object_decode" in node.attrs:
-            what = f"{name} is a MATLAB object ({_plain(node.attrs.get('MATLAB_class', 'unknown'))}), not an array"
-            raise DataError(what, where=path, fix="Save it from MATLAB as arrays, or with writetable as CSV")
-        if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "iufb" or name.startswith("#"):
-            return
-        if node.external or node.is_virtual:
-            raise DataError(f"{name} lies in another file", where=path, fix="Copy it into this file")
-        check_size(path, node.size * 8)
-        unit = next((value for key, value in node.attrs.items() if key.lower() in ("unit", "units")), "")
-        columns.add(name, node[()], _plain(unit))
-
-    with h5py.File(path, "r") as file:
-        visit("", file)
-        file.visititems(visit)
-        file.visititems_links(look)
-    if elsewhere:
-        what = f"{', '.join(elsewhere)}: links to other files, which are not followed"
-        if not columns.values:
-            raise DataError(what, where=path, fix="Copy the arrays into this file")
-        columns.remarks.losses.append(what)
-
-
-def _plain(attribute: Any) -> str:
-    """Text of an attribute, which MATLAB writes as bytes."""
-    return attribute.decode(errors="replace") if isinstance(attribute, bytes) else str(attribute)
-
-
 def _refuse_sheets(path: Path, columns: Columns) -> None:
     fix = "Save it as .xlsx or CSV (UTF-8), and convert that"
     raise DataError("is a spreadsheet of another format", where=path, expected=".xlsx or .xls", fix=fix)
@@ -291,6 +246,7 @@ LOADERS: dict[str, Callable[[Path, Columns], None]] = {
     "npz": _load_npz,
     "npy": _load_npy,
     "mat": load_mat,
-    "hdf5": _load_hdf5,
+    "hdf5": load_hdf5,
+    "sheets": lambda path, columns: load_sheets(path, columns, read_text),
     "other sheets": _refuse_sheets,
 }

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from contextlib import suppress
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -23,26 +23,19 @@ from ._archive import refusing
 from ._source import find_folders, head
 from ._table_files import kind_of, load, npy_shape, read_npy
 from ._table_geodetic import add_local
-from ._table_groups import TRUE_GROUPS
 from ._table_header import MOSTLY
 from ._table_look import look, span_ns
-from ._table_map import IMU_GROUP, POSES_GROUP, TRUTH_GROUP
+from ._table_map import POSES_GROUP, TRUTH_GROUP
 from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_packed import read_bytes, table_name
-from ._table_sensors import SENSORS, SPACED, WORD, name_columns, pairs_among, plain_among, sensors_among
+from ._table_roles import Names, role_folders, role_groups, shared_names, without_role
+from ._table_sensors import SENSORS, name_columns, sensors_among
 from ._table_text import LOOKED_AT, Columns, is_text_table, read_csv, text_of
 from ._table_times import rises
 from .sensor_tables import is_phone
 
 MOST_TABLES = 40  # of one recording
-MOST_LARGER = 1.2  # ratio of the sizes of files of IMUs that were recorded together
 DATA_FILE = "data.hdf5"  # of RoNIN
-IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of UZH-FPV's imu.txt; else its columns show it
-IMUS = r"(imu|inertial)[ _-]?\w{1,20}"  # of several beside one file of poses: imu_1, imu_left
-POSES = rf"(.*[ _-])?({TRUE_GROUPS}|ground[ _-]truth)([ _-].*)?"  # groundtruth.txt, stamped_groundtruth_imu.txt
-REFERENCE = r"(.*[ _-])?ref(erence)?([ _-].*)?"  # of poses; of rates it is an ideal sensor
-ROLES = "imu|inertial|ground|truth|poses?|raw|rots?|ref|reference"
-ROLE = "|".join([ROLES, TRUE_GROUPS, *SENSORS.values()])  # a word in the name of a file
 ENDINGS = (
     ".csv",
     ".txt",
@@ -68,7 +61,9 @@ def sequences_below(source: Path) -> list[Sequence]:
     found: dict[Path, list[Sequence]] = {}
 
     def is_mine(folder: Path) -> bool:
-        return bool(found.setdefault(folder, _sequences_in(folder)))
+        above = next((each for each in folder.parents if found.get(each)), folder)
+        is_part = any(each in (folder, *folder.parents) for each in role_folders(above))
+        return bool(found.setdefault(folder, [] if is_part else _sequences_in(folder)))
 
     find_folders(source, is_mine, lambda folder: found[folder][0].path.is_dir())  # whose folders may be sensors of it
     return [*chain(*found.values())]
@@ -78,12 +73,12 @@ def _sequences_in(folder: Path) -> list[Sequence]:
     """Recordings of a folder: `data.hdf5`, or its tables together, in pairs or one by one.
 
     Together are tables of a gyroscope and an accelerometer, of several such pairs, or of one IMU and of poses: all of the
-    folder, or those whose names differ in that alone (`walk_imu`, `walk_gt`). None are of a phone app.
+    folder, or those whose names differ in that alone (`walk_imu`, `walk_gt`; `imu/walk`, `gt/walk`). None are of a phone app.
     """
     if kind_of(head(folder / DATA_FILE), folder / DATA_FILE) == "hdf5":
         return [Sequence(folder.name, folder / DATA_FILE)]
     found = {} if is_phone(folder) else _recordings(folder)
-    places = {name: (tables[0], "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
+    places = {name: (*tables, "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
     return [Sequence(folder.name if len(found) == 1 else name, *place) for name, place in places.items()]
 
 
@@ -94,9 +89,9 @@ def load_split(folder: Path, recording: str = "") -> Columns:
         DataError: the table of the gyroscope, of the accelerometer or of the IMU cannot be read.
     """
     tables, whole, clocks = _recordings(folder)[recording], Columns(), _clocks(folder)
-    groups = _groups(tables)
-    for path in tables:
-        group = groups.get(path, _stem(path))
+    groups = role_groups(tables)
+    for path, stem in tables.items():
+        group = groups.get(path, stem)
         sensor = group.rpartition("/")[2] if path in groups and group.rpartition("/")[2] in SENSORS else ""
         try:
             part = _load(path)
@@ -147,27 +142,45 @@ def _is_time(path: Path) -> bool:
     return re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(_stem(path))[0]) is not None
 
 
-def _recordings(folder: Path) -> dict[str, list[Path]]:
-    """Tables of each recording of a folder, by its name; the name is empty where all tables are one recording."""
-    tables = _tables(folder)
-    if groups := _groups(tables[:MOST_TABLES]):
-        parts = _apart_in_time(groups) if groups.keys() == {*tables} else []
+def _stems(folder: Path) -> dict[Path, str]:
+    """Names of the tables of a folder, without endings, and of those below `imu/` and `vicon/` in it."""
+    stems = {path: _stem(path) for path in _tables(folder)}
+    for role in role_folders(folder):
+        for each in (role, *sorted(below for pattern in ("*/", "*/*/") for below in role.glob(pattern))):
+            stems |= {path: "_".join((*each.relative_to(role).parts, _stem(path))) for path in _tables(each)}
+    return stems
+
+
+def _recordings(folder: Path) -> dict[str, Names]:
+    """Tables of each recording of a folder, by its name; the name is empty where all tables are one recording.
+
+    The names of tables below `imu/` and `vicon/` begin with that of their folder.
+    """
+    stems = _stems(folder)
+    roles = {path: f"{path.relative_to(folder).parts[0]}_" if path.parent != folder else "" for path in stems}
+    names = {path: roles[path] + stem for path, stem in stems.items()}
+    first = dict(islice(names.items(), MOST_TABLES))
+    if groups := role_groups(first):
+        parts = _apart_in_time(groups) if groups.keys() == names.keys() else []
         if len(parts) > 1:
-            return {_without_role(_stem(min(part))): sorted(part) for part in parts}
-        return {"": tables[:MOST_TABLES]}
-    count = Counter(map(_stem, tables))
-    stems = {path: _stem(path) if count[_stem(path)] == 1 else path.name for path in tables}  # imu.csv beside imu.txt
-    alike: dict[str, list[Path]] = {}
-    for path in tables:
-        alike.setdefault(_without_role(_stem(path)), []).append(path)
-    found: dict[str, list[Path]] = {}
-    of_imus = {look(path).header for path in tables if look(path).is_imu} - {()}  # one that shows less is a recording, too
+            return {without_role(stems[min(part)]): {path: names[path] for path in sorted(part)} for part in parts}
+        return {"": first}
+    labels = stems
+    for others in ({path: path.name for path in names}, names):  # imu.csv beside imu.txt, imu/1.csv beside vicon/1.csv
+        count = Counter(labels.values())
+        labels = {path: label if count[label] == 1 else others[path] for path, label in labels.items()}
+    alike: dict[str, dict[Path, str]] = {}
+    for path, shared in shared_names(stems, roles).items():
+        alike.setdefault(shared, {})[path] = names[path]
+    found: dict[str, Names] = {}
+    of_imus = {look(path).header for path in names if look(path).is_imu} - {()}  # one that shows less is a recording, too
     for shared, paths in alike.items():
-        first = _stem(paths[0])
-        name = first if shared.isdigit() and not first.startswith(shared) else shared  # imuRaw1 beside viconRot1
-        own = {stems[path]: [path] for path in paths if look(path).is_imu or look(path).header in of_imus}
-        found |= {name: paths} if name and _groups(paths) else own
-    return found or {stems[path]: [path] for path in tables if look(path).may_be_imu}
+        groups = role_groups(paths)
+        stem = stems[next((path for path in groups if groups[path] not in (TRUTH_GROUP, POSES_GROUP)), next(iter(paths)))]
+        name = stem if shared.replace(" ", "").isdigit() and not stem.startswith(shared) else shared  # imuRaw1 beside viconRot1
+        own = {labels[path]: {path: names[path]} for path in paths if look(path).is_imu or look(path).header in of_imus}
+        found |= {name: paths} if name and groups else own
+    return found or {labels[path]: {path: names[path]} for path in names if look(path).may_be_imu}
 
 
 def _apart_in_time(groups: dict[Path, str]) -> list[list[Path]]:
@@ -186,12 +199,6 @@ def _apart_in_time(groups: dict[Path, str]) -> list[list[Path]]:
         parts[-1] += pair
         end = max(end, *(known[path][1] for path in pair))
     return parts
-
-
-def _without_role(stem: str) -> str:
-    """Name of a file without the words that say what its table holds."""
-    parts = re.split(rf"({WORD}|\d+)", stem)
-    return "".join(part for part in parts if not re.fullmatch(ROLE, part.lower())).strip("_- .")
 
 
 def _is_narrow(path: Path) -> bool:
@@ -258,38 +265,6 @@ def _load(path: Path) -> Columns:
     if not part.values:
         raise DataError("holds no columns of numbers", where=path)
     return part
-
-
-def _groups(tables: list[Path]) -> dict[Path, str]:
-    """Groups of the tables that make a recording: gyro and accel of one or several IMUs, or IMUs and poses; else none."""
-    sensors, seen = sensors_among(map(_stem, tables)), {path: look(path) for path in tables}
-    several = pairs_among(map(_stem, tables)) or plain_among(map(_stem, tables))
-    groups = sensors if {*sensors.values()} == {*SENSORS} else several
-    of_sensors = {path: groups[_stem(path)] for path in tables if _stem(path) in groups}
-    captured = [path for path in tables if seen[path].is_mocap]
-    words = {path: re.sub(SPACED, "_", _stem(path)).lower() for path in tables}  # viconRot1
-    true = captured or [path for path in tables if re.fullmatch(POSES, words[path])]
-    true = true or [p for p in tables if re.fullmatch(REFERENCE, words[p]) and seen[p].has_poses and not seen[p].is_imu]
-    if of_sensors:
-        return of_sensors | {path: TRUTH_GROUP for path in true if len(true) == 1 and path not in of_sensors}
-    shown = [path for path in tables if seen[path].is_imu and path not in true]
-    imus = [path for path in tables if re.fullmatch(IMU, words[path]) and path not in true] or shown
-    poses = true or [path for path in tables if seen[path].has_poses and path not in shown]
-    if not poses and len(imus) == len(shown) == 1 and any(seen[path].has_time for path in tables if path not in shown):
-        return {shown[0]: IMU_GROUP}
-    if len(poses) != 1 or poses[0] in imus:
-        return {}
-    beside = {poses[0]: TRUTH_GROUP if true else POSES_GROUP}
-    together = [path for path in shown if re.fullmatch(IMUS, _stem(path).lower())]
-    if len(together) > 1 and _of_one_size(together):
-        return {path: re.sub(r"[ -]", "_", _stem(path).lower()) for path in together} | beside
-    return {imus[0]: IMU_GROUP} | beside if len(imus) == 1 else {}
-
-
-def _of_one_size(paths: list[Path]) -> bool:
-    """Whether files have about as many bytes, as those of IMUs that were recorded together have."""
-    sizes = [path.stat().st_size for path in paths]
-    return max(sizes) < MOST_LARGER * min(sizes)
 
 
 def _stem(path: Path) -> str:

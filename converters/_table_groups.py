@@ -9,7 +9,7 @@ from itertools import chain
 
 from ._table_geodetic import fits_gravity
 from ._table_map import IMU_TOPIC, Entries, column_named
-from ._table_names import ESTIMATED, TIME_WORDS, name_and_unit, spaced_name, split_name, triples
+from ._table_names import ESTIMATED, TIME_WORDS, group_of, name_and_unit, spaced_name, split_name, triples
 from ._table_pose_names import NED, NUMBERS, QUATERNION, QUATERNION_ARRAY, angles_of, axes_of, bodies_of, matrix_of, position_of
 from ._table_rotations import EITHER_WAY, TURNS, angles_by_motion, matrix_by_motion, order_by_motion
 from ._table_text import Columns, matrix_columns
@@ -235,11 +235,6 @@ def _raw_counts(columns: Columns) -> set[str]:
 def is_true(column: str) -> bool:
     """Whether a column is in a group of true poses."""
     return any(re.fullmatch(TRUE_GROUPS, part.lower()) for part in re.split(r"[/.]", group_of(column)))
-
-
-def group_of(column: str) -> str:
-    """Group of a column: `mocap` of `mocap/v [m/s]`, and of a structure's `mocap.position[0]`."""
-    return re.sub(r"(^|[/.])[^/.]*$", "", re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", column))
 
 
 def shared_group(time: str, column: str) -> int:

@@ -50,7 +50,7 @@ def load_json(path: Path, columns: Columns) -> None:
             for kind, rows in _kinds(node).items():
                 tables["/".join(filter(None, (name, kind)))] = rows
         elif isinstance(node, list):
-            columns.add(name, _numbers(node))
+            columns.add(name, node if isinstance(node[0], str) else _numbers(node))
         else:
             columns.numbers[name] = float(_numbers([node])[0])
     name_headerless(columns)
@@ -62,11 +62,8 @@ def load_json(path: Path, columns: Columns) -> None:
         if len(tables) == 1:
             beside = name.removesuffix(name.rpartition(".")[2])  # as a rate beside the samples: `imu.frequency`, `imu.data`
             columns.numbers = {number.removeprefix(beside): value for number, value in columns.numbers.items()}
-            columns.values, columns.texts, columns.units = (
-                part.values | columns.values,
-                part.texts,
-                part.units | columns.units,
-            )
+            columns.values, columns.units = part.values | columns.values, part.units | columns.units
+            columns.texts, columns.labels = part.texts, part.labels | columns.labels
             columns.remarks.notes.extend(part.remarks.notes)
             columns.remarks.losses.extend(part.remarks.losses)
         else:
@@ -114,11 +111,15 @@ def _nodes(node: Any, name: str) -> Iterator[tuple[str, Any]]:
         yield name, node
     elif _is_matrix(node):
         yield from ((f"{name}[{n}]" if name else f"column {n + 1}", [row[n] for row in node]) for n in range(len(node[0])))
-    elif len(node) >= LEAST_ROWS and all(isinstance(value, int | float | None) for value in node):
+    elif len(node) >= LEAST_ROWS and (_are(node, int | float | None) or _are(node, str)):
         yield name or "values", node
     else:
         for number, child in enumerate(node):
             yield from _nodes(child, f"{name}.{number}" if name else str(number))
+
+
+def _are(values: list[Any], kind: Any) -> bool:
+    return all(isinstance(value, kind) for value in values)
 
 
 def _numbers(values: list[Any]) -> np.ndarray:

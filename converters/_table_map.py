@@ -36,6 +36,7 @@ TRUE_ENTRIES = {"truth_time", "position", "quaternion_wxyz", "roll_pitch_yaw", "
 CLOCKS = "time", "accel_time", "truth_time", "counter"
 IMU_GROUP = "imu"  # in front of the columns of an IMU beside another table
 TRUTH_GROUP, POSES_GROUP = "ground_truth", "poses"  # of that other table
+POSE_GROUPS = f"{TRUTH_GROUP}/", f"{POSES_GROUP}/"
 OF_COUNTS = {"gyro_scale", "gyro_offset", "accel_scale", "accel_offset"}
 NO_UNIT = "the names of the columns state no unit of the {} that imutool knows, and its values show none"
 
@@ -126,9 +127,17 @@ def _toml(path: Path) -> dict[str, Any]:
 
 
 def within_groups(given: Entries, columns: Columns) -> Entries:
-    """Entries with the group in front of the names of columns, if one table alone has them."""
+    """Entries with the group in front of the names of columns, if one table alone has them.
+
+    A map of a folder also holds for a table without a group, which has none beside it.
+    """
     out = dict(given)
-    for entry in {*LISTS, *CLOCKS} & given.keys():
+    beside = {c for e in TRUE_ENTRIES & given.keys() for c in np.atleast_1d(given[e]).tolist() if c.startswith(POSE_GROUPS)}
+    if beside and not any(column.startswith(POSE_GROUPS) for column in columns.values):
+        out = {entry: value for entry, value in given.items() if entry not in {*TRUE_ENTRIES, "truth_time_unit", "pose_kind"}}
+        left = ", ".join(sorted(given.keys() - out.keys()))
+        columns.remarks.notes.append(f"no table of poses is beside it: {left} are left out")
+    for entry in {*LISTS, *CLOCKS} & out.keys():
         of_imu = entry not in TRUE_ENTRIES
         if of_imu or "truth_file" not in given:
             names = [given[entry]] if isinstance(given[entry], str) else given[entry]
@@ -140,9 +149,10 @@ def within_groups(given: Entries, columns: Columns) -> Entries:
 def _within_group(name: str, columns: Columns, of_imu: bool) -> str:
     plain = columns.unsigned(name)
     names = {*columns.values, *(column.removesuffix("[0][0]") for column in columns.values)}
+    if plain not in names and (alone := plain.removeprefix(f"{IMU_GROUP}/")) in names:
+        return name.replace(plain, alone)
     among = [] if plain in names else [each for each in names if each.endswith(f"/{plain}")]
-    groups = (IMU_GROUP,) if of_imu else (TRUTH_GROUP, POSES_GROUP)
-    own = [each for each in among if each.startswith(tuple(f"{group}/" for group in groups))]
+    own = [each for each in among if each.startswith(f"{IMU_GROUP}/" if of_imu else POSE_GROUPS)]
     own = own or [each for each in among if of_imu or not each.startswith(f"{IMU_GROUP}/")] or among
     return name.replace(plain, own[0]) if len(own) == 1 else name
 

@@ -87,13 +87,29 @@ def _unpacked_bytes(path: Path) -> int:
 
 
 def _flat(content: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any, list[str]]]:
-    """Arrays of nested structures, with dotted names, and the labels of their columns."""
+    """Arrays of nested structures, with dotted names, and the labels of their columns.
+
+    `data(2).gyro` and `gyro{2}` are numbered in front of the array: `data.2.gyro`, `2.gyro`.
+    """
     for name, value in content.items():
-        if not name.startswith("__"):
-            if isinstance(value, dict):
-                yield from _flat(value, f"{prefix}{name}.")
-            elif isinstance(value, np.ndarray | int | float):
-                yield f"{prefix}{name}", value, _labels(name, value, content)
+        if name.startswith("__"):
+            continue
+        cells = value if isinstance(value, list) else _cells(value)
+        for number, cell in enumerate(cells, 1):
+            if isinstance(cell, dict):
+                yield from _flat(cell, f"{prefix}{name}.{number}.")
+            elif isinstance(cell, np.ndarray):
+                yield from _flat({name: cell}, f"{prefix}{number}.")
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        elif isinstance(value, np.ndarray | int | float) and not cells:
+            yield f"{prefix}{name}", value, _labels(name, value, content)
+
+
+def _cells(value: Any) -> list[Any]:
+    """Arrays of a cell array; none of other values, or of texts."""
+    cells = value.ravel().tolist() if isinstance(value, np.ndarray) and value.dtype.kind == "O" else []
+    return cells if any(isinstance(cell, np.ndarray | dict) for cell in cells) else []
 
 
 def _labels(name: str, value: Any, beside: dict[str, Any]) -> list[str]:

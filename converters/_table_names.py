@@ -102,6 +102,16 @@ def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[st
     return dict(zip(named, whole.values(), strict=True))
 
 
+def group_of(column: str) -> str:
+    """Group of a column: `mocap` of `mocap/v [m/s]`, and of a structure's `mocap.position[0]`."""
+    return re.sub(r"(^|[/.])[^/.]*$", "", re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", column))
+
+
+def leaf_of(column: str) -> str:
+    """Name of a column without its group."""
+    return column.removeprefix(group_of(column)).lstrip("/.")
+
+
 def is_of_recordings(column: str) -> bool:
     """Whether a column is named as one that tells recordings apart: `trial`, `Subject ID`."""
     return re.fullmatch(rf"(({RECORDINGS}){NUMBERED}|id)", spaced_name(column)) is not None
@@ -112,6 +122,25 @@ def is_of_sensors(column: str) -> bool:
     return (
         re.fullmatch(rf"(({SENSORS})|(sensor|device|imu)_({SENSORS})){NUMBERED}|mac|address", spaced_name(column)) is not None
     )
+
+
+def tells_apart(column: str) -> bool:
+    """Whether a column is named as one that tells recordings or sensors apart."""
+    return is_of_recordings(column) or is_of_sensors(column)
+
+
+def is_recording(group: str) -> bool:
+    """Whether a group is named as one of several recordings: `trial3`, `Subject_A`."""
+    return re.fullmatch(rf"({RECORDINGS})s?(_?\d.*|_.+)?", _plain(group)) is not None
+
+
+def is_sensor(group: str) -> bool:
+    """Whether a group is named as one of several sensors: `imu_left`, `sensor2`, `wrist`."""
+    return re.fullmatch(rf"(.*_)?({SENSORS}|inertial)s?(_?\d.*|_.+)?|{PLACES}(_?\d+)?", _plain(group)) is not None
+
+
+def _plain(group: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "_", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", group).lower()).strip("_")
 
 
 def name_and_unit(column: str, beside: str) -> tuple[str, str]:

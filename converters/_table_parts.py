@@ -1,15 +1,15 @@
-"""Recordings and sensors that columns of one table tell apart: `trial`, `placement`.
+"""Recordings and sensors of one file, in groups, or by columns that tell them apart.
 
-A table is several recordings where such a column is beside a time that goes back, or beside no time. Sensors are IMUs of one
-recording where they have times in common.
+A table is several recordings where such a column (`trial`) is beside a time that goes back, or beside no time. Sensors
+(`placement`) are IMUs of one recording where they have times in common. Columns of one length are a table.
 """
 
 from __future__ import annotations
 
-import copy
 import re
 from collections.abc import Callable
-from functools import lru_cache
+from dataclasses import replace
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -19,27 +19,28 @@ from imutool.errors import ConfigError, DataError
 
 from . import Sequence
 from ._source import head
-from ._table_files import kind_of, load, names_of
-from ._table_names import TIME_WORDS, is_of_recordings, is_of_sensors, split_name
+from ._table_files import kind_of, load, may_hold_several
+from ._table_names import TIME_WORDS, group_of, is_of_recordings, is_of_sensors, leaf_of, split_name, tells_apart
+from ._table_recordings import distinct, groups_apart, part_name, renamed
 from ._table_text import Columns, no_numbers
 from ._table_times import LEAST_ROWS, begun_anew, is_counter
 
 NOT_BACK, UP = 0.99, 0.5  # shares of the steps of a time that do not go back, and that go on
-LONGEST_LABEL = 40  # characters, of a file's name
 MOST_BY_TURNS = 60  # recordings whose rows come by turns
 FIX = (
     "Leave `rate_hz` out if a column is the time of each row; else give each recording a table of its own, or name the column"
-    " that tells them apart `trial`, in a table of text with a header"
+    " that tells them apart `trial`"
 )
 Labels = dict[str, np.ndarray]
 Rows = Int64[np.ndarray, " n"]
+TableRows = dict[int, Rows]  # of a recording, in each table whose columns are of that length
 
 
 def recordings_in(found: Sequence) -> list[Sequence]:
-    """The table as one recording, or those that its columns tell apart."""
+    """The file as one recording, or those that its groups or its columns tell apart."""
     try:
-        several = found.path.is_file() and not found.inside and _may_hold_several(found.path)
-        parts = _parts(_loaded(found.path)) if several else {}
+        several = found.path.is_file() and not found.inside and may_hold_several(found.path)
+        parts = _recordings(found.path) if several else {}
     except (ConfigError, DataError):  # said when it is read
         return [found]
     return [Sequence(f"{found.name}_{name}", found.path, name) for name in parts] if len(parts) > 1 else [found]
@@ -47,12 +48,16 @@ def recordings_in(found: Sequence) -> list[Sequence]:
 
 def load_table(path: Path, inside: str) -> Columns:
     """Columns of a table file, or of one of its recordings; several sensors are groups."""
-    if not _may_hold_several(path):
-        return load(path, kind_of(head(path), path), inside)
-    whole = _loaded(path)
-    columns = _with_rows(whole, _parts(whole)[inside], is_of_recordings) if inside else copy.deepcopy(whole)
-    sensors = _labels(columns, is_of_sensors)
-    return _grouped(columns, sensors) if sensors and _share_time(columns, sensors) else columns
+    if not may_hold_several(path):
+        return load(path, kind_of(head(path), path))
+    parts = _recordings(path)
+    if len(parts) == 1:
+        _recordings_once.cache_clear()  # whose columns are handed on as they are
+    columns = parts[inside]()
+    for length, sensors in _labels(columns, is_of_sensors).items():
+        if _share_time(columns, sensors):
+            columns = _grouped(columns, length, sensors)
+    return columns
 
 
 def refuse_joined(columns: Columns, gyro: str, place: Path) -> None:
@@ -64,8 +69,8 @@ def refuse_joined(columns: Columns, gyro: str, place: Path) -> None:
     texts = {name: np.array(each) for name, each in columns.labels.items()}
     of_rows = {name: v for name, v in (columns.values | texts).items() if len(v) == len(columns.values[gyro])}
     for name, values in of_rows.items():
-        leaf, what = name.rpartition("/")[2], ""
-        if is_of_recordings(leaf) or is_of_sensors(leaf):
+        leaf, what = leaf_of(name), ""
+        if tells_apart(leaf):
             labels = _texts(values)
             what = f"{name!r} has {len(np.unique(labels))} values, as of several recordings" if labels is not None else ""
         elif (_is_time(leaf) or is_counter(leaf)) and len(rows := begun_anew(values)):
@@ -74,18 +79,19 @@ def refuse_joined(columns: Columns, gyro: str, place: Path) -> None:
             raise ConfigError(f"{what}, and `rate_hz` would join them", where=place, expected="rows of one recording", fix=FIX)
 
 
-def _may_hold_several(path: Path) -> bool:
-    return any(is_of_recordings(name) or is_of_sensors(name) for name in names_of(path))
-
-
-def _loaded(path: Path) -> Columns:
+def _recordings(path: Path) -> dict[str, Callable[[], Columns]]:
+    """What gives the columns of each recording, by its name; of the only one without a name."""
     status = path.stat()
-    return _loaded_once(path, status.st_mtime_ns, status.st_size)
+    return _recordings_once(path, status.st_mtime_ns, status.st_size)
 
 
-@lru_cache(maxsize=1)  # the recordings of a table follow one another
-def _loaded_once(path: Path, mtime_ns: int, size: int) -> Columns:  # the key notices a changed file
-    return load(path, kind_of(head(path), path))
+@lru_cache(maxsize=1)  # the recordings of a file follow one another
+def _recordings_once(path: Path, mtime_ns: int, size: int) -> dict[str, Callable[[], Columns]]:  # the key notices a change
+    found: dict[str, Callable[[], Columns]] = {}
+    for group, columns in groups_apart(load(path, kind_of(head(path), path))).items():
+        for name, rows in _parts(columns).items():
+            found[distinct("_".join(filter(None, (group, name))), found)] = partial(_with_rows, columns, rows, is_of_recordings)
+    return found
 
 
 def _texts(values: np.ndarray) -> np.ndarray | None:
@@ -97,14 +103,16 @@ def _texts(values: np.ndarray) -> np.ndarray | None:
     return values.astype(str) if 2 <= len(np.unique(values)) <= len(values) / LEAST_ROWS else None
 
 
-def _labels(columns: Columns, is_named: Callable[[str], bool]) -> Labels:
-    """Columns of labels that are named so, in a table whose columns are all of one length."""
-    lengths = {len(values) for values in columns.values.values()}
-    if len(lengths) != 1 or columns.sources:
-        return {}
+def _labels(columns: Columns, is_named: Callable[[str], bool]) -> dict[int, Labels]:
+    """Columns of labels that are named so, by the length of their table."""
     every = columns.values | {name: np.array(texts) for name, texts in columns.labels.items()}
-    texts = {name: _texts(values) for name, values in every.items() if is_named(name)}
-    return {name: each for name, each in texts.items() if each is not None}
+    found: dict[int, Labels] = {}
+    for name, values in every.items():
+        if is_named(leaf_of(name)) and (texts := _texts(values)) is not None:
+            beside = found.setdefault(len(texts), {})
+            if not any(np.array_equal(texts, other) for other in beside.values()):  # of the gyro, and of the accelerometer
+                beside[name] = texts
+    return found
 
 
 def _is_time(name: str) -> bool:
@@ -113,7 +121,8 @@ def _is_time(name: str) -> bool:
 
 def _clocks(columns: Columns, order: Rows, seams: Int64[np.ndarray, " k"]) -> list[np.ndarray]:
     """Times of a table, in the order of its parts; each goes on within a part."""
-    named = (values[order].astype(float) for name, values in columns.values.items() if _is_time(name))
+    of_rows = ((name, values) for name, values in columns.values.items() if len(values) == len(order))
+    named = (values[order].astype(float) for name, values in of_rows if _is_time(name))
     inside = np.delete(np.arange(len(order) - 1), seams - 1)
     steps = ((values, np.diff(values)[inside]) for values in named)
     return [
@@ -127,19 +136,38 @@ def _codes(labels: Labels) -> Rows:
     return np.unique(each, axis=1, return_inverse=True)[1].reshape(-1)
 
 
-def _parts(columns: Columns) -> dict[str, Rows]:
-    """Rows of each recording of a table, by name; all rows without a name where it is one."""
+def _parts(columns: Columns) -> dict[str, TableRows]:
+    """Rows of each recording of a file, by its name; without a name where it is one, whose rows stay as they are.
+
+    The longest table with such a column says which there are; those of others that have one follow it.
+    """
     recordings, sensors = _labels(columns, is_of_recordings), _labels(columns, is_of_sensors)
-    parts = _apart(columns, recordings)
-    of_each = ({name: texts[rows] for name, texts in sensors.items()} for rows in parts.values())
-    together = (_share_time(_with_rows(columns, rows), each) for rows, each in zip(parts.values(), of_each, strict=True))
-    return parts if not sensors or all(together) else _apart(columns, recordings | sensors, always=True)
+    every = {length: recordings.get(length, {}) | sensors.get(length, {}) for length in recordings.keys() | sensors.keys()}
+    if not every:
+        return {"": {}}
+    longest = max(every)
+    parts = _apart(columns, longest, recordings.get(longest, {}))
+    of_each = ({name: texts[rows] for name, texts in sensors.get(longest, {}).items()} for rows in parts.values())
+    whole = [_with_rows(columns, {longest: rows}) for rows in parts.values()]
+    if not all(_share_time(each, labels) for each, labels in zip(whole, of_each, strict=True) if labels):
+        parts, recordings = _apart(columns, longest, every[longest], always=True), every
+    if len(parts) == 1:
+        return {"": {}}
+    found = {name: {longest: rows} for name, rows in parts.items()}
+    for length in recordings.keys() - {longest}:
+        others = _apart(columns, length, recordings[length], always=True)
+        for name, rows in found.items():
+            rows[length] = others.get(name, np.zeros(0, np.int64))
+    return found
 
 
-def _apart(columns: Columns, labels: Labels, *, always: bool = False) -> dict[str, Rows]:
-    """Rows of the recordings that labels tell apart; unless `always`, all rows where a time goes on from each to the next."""
+def _apart(columns: Columns, length: int, labels: Labels, *, always: bool = False) -> dict[str, Rows]:
+    """Rows of the recordings that labels of a table tell apart.
+
+    All rows without labels, and unless `always` where a time goes on from each to the next.
+    """
     if not labels:
-        return {"": np.arange(max(map(len, columns.values.values()), default=0))}
+        return {"": np.arange(length)}
     codes = _codes(labels)
     runs = np.concatenate([[0], np.cumsum(np.diff(codes) != 0)])
     in_blocks = runs[-1] + 1 <= len(runs) / LEAST_ROWS
@@ -153,16 +181,9 @@ def _apart(columns: Columns, labels: Labels, *, always: bool = False) -> dict[st
         return {"": order}
     found: dict[str, Rows] = {}
     for rows in np.split(order, seams):
-        name = "_".join(_part_name(column, str(texts[rows[0]])) for column, texts in labels.items())
-        again = sum(re.fullmatch(rf"{re.escape(name)}( \d+)?", other) is not None for other in found)
-        found[f"{name} {again + 1}" if again else name] = np.sort(rows)
+        name = "_".join(part_name(leaf_of(column), str(texts[rows[0]])) for column, texts in labels.items())
+        found[distinct(name, found)] = np.sort(rows)
     return found
-
-
-def _part_name(column: str, text: str) -> str:
-    """Name of a recording by its label: `trial_3`, and `S01` for a label that is no number."""
-    plain = re.sub(r"[^\w.+-]+", "_", text).strip("_.")[:LONGEST_LABEL] or "blank"
-    return f"{split_name(column)[0] or 'part'}_{plain}" if plain.isdigit() else plain
 
 
 def _share_time(columns: Columns, sensors: Labels) -> bool:
@@ -174,33 +195,50 @@ def _share_time(columns: Columns, sensors: Labels) -> bool:
     return not len(seams) or any(max(start for start, _ in each) < min(end for _, end in each) for each in spans)
 
 
-def _with_rows(columns: Columns, rows: Rows, named: Callable[[str], bool] | None = None) -> Columns:
-    """Some rows of a table; of columns that are `named` so the texts are in the recording's name."""
-    used = [name for name in columns.labels if named is not None and named(name)]
-    part = Columns(units=dict(columns.units), numbers=dict(columns.numbers), sources=dict(columns.sources))
-    part.values = {name: values[rows] for name, values in columns.values.items()}
-    part.texts = {name: [texts[row] for row in rows.tolist()] for name, texts in columns.texts.items()}
-    part.labels = {name: [texts[row] for row in rows.tolist()] for name, texts in columns.labels.items() if name not in used}
+def _with_rows(columns: Columns, rows: TableRows, named: Callable[[str], bool] | None = None) -> Columns:
+    """Columns with some rows of their tables; without any, as they are.
+
+    Of columns that are `named` so the texts are in the recording's name.
+    """
+    if not rows:
+        return columns
+    used = [name for name in columns.labels if named is not None and named(leaf_of(name))]
+    part = replace(columns, remarks=replace(columns.remarks))
+    kept = {name: rows.get(len(values)) for name, values in (columns.values | columns.labels).items()}
+    part.values = {n: each if kept[n] is None else each[kept[n]] for n, each in columns.values.items() if _is_left(kept[n])}
+    part.texts = {n: _texts_in(each, kept[n]) for n, each in columns.texts.items() if n in part.values}
+    part.labels = {n: _texts_in(e, kept[n]) for n, e in columns.labels.items() if n not in used and _is_left(kept[n])}
     part.remarks.notes, part.remarks.losses = [*columns.remarks.notes], [*columns.remarks.losses]
     _leave_out_losses(part, columns, used)
     return part
 
 
+def _is_left(rows: Rows | None) -> bool:
+    return rows is None or len(rows) > 0
+
+
+def _texts_in(texts: list[str], rows: Rows | None) -> list[str]:
+    return texts if rows is None else [texts[row] for row in rows.tolist()]
+
+
 def _leave_out_losses(part: Columns, columns: Columns, used: list[str]) -> None:
     """Take back that columns of texts are lost, which tell recordings or sensors apart."""
-    taken = {no_numbers(name, columns.labels[name]) for name in used if name in columns.labels}
-    part.remarks.losses[:] = [loss for loss in part.remarks.losses if loss not in taken]
+    said = [no_numbers(n, columns.labels[name]) for name in used if name in columns.labels for n in (name, leaf_of(name))]
+    part.remarks.losses[:] = [loss for loss in part.remarks.losses if not loss.endswith(tuple(said))]
 
 
-def _grouped(columns: Columns, sensors: Labels) -> Columns:
-    """Columns of each sensor in a group of its name."""
-    codes, whole = _codes(sensors), Columns(numbers=columns.numbers, remarks=columns.remarks)
+def _grouped(columns: Columns, length: int, sensors: Labels) -> Columns:
+    """Columns with those of a table in a group of the name of each sensor."""
+    codes, whole = _codes(sensors), replace(columns)
     _leave_out_losses(whole, columns, [*sensors])
+    of_table = [name for name, values in (columns.values | columns.labels).items() if len(values) == length]
+    for field in ("values", "units", "texts", "labels"):
+        setattr(whole, field, {name: each for name, each in getattr(columns, field).items() if name not in of_table})
+    around = {group_of(name) for name in of_table}
+    names = {name: leaf_of(name) if len(around) == 1 else name for name in of_table if name not in sensors}
     for code in dict.fromkeys(codes.tolist()):
         rows = np.flatnonzero(codes == code)
         label = "_".join(str(texts[rows[0]]) for texts in sensors.values())
-        part = _with_rows(columns, rows)
-        part.values = {name: values for name, values in part.values.items() if name not in sensors}
-        part.numbers, part.remarks = {}, type(columns.remarks)()
+        part = _with_rows(replace(renamed(columns, names), labels={}), {length: rows})
         whole.take(label, part, label)
     return whole

@@ -19,6 +19,7 @@ from ._table_names import (
     ESTIMATED,
     SI_WORDS,
     WITHOUT_GRAVITY,
+    group_of,
     name_and_unit,
     spaced_name,
     triples,
@@ -50,6 +51,7 @@ def propose(columns: Columns, given: Entries = NOTHING) -> Proposal:
     proposal = Proposal({}, [], [])
     names = {column: name_and_unit(column, columns.units.get(column, "")) for column in measured(columns)}
     sensors = {sensor: _triples(sensor, names, columns) for sensor in ("gyro", "accel")}
+    sensors["accel"] = _beside(sensors["gyro"], sensors["accel"])
     if not any(sensors.values()) and (array := in_an_array(columns)):
         proposal.reasons.append(f"{', '.join(array['accel'])} show gravity and count as the accel")
         given = array | given
@@ -131,6 +133,12 @@ def _triples(sensor: str, names: dict[str, tuple[str, str]], columns: Columns) -
     spaced = {column: spaced_name(column) for column in names}
     every = [*triples(sensor, plain, spaced).values()]
     return [triple for triple in every if not re.search(ESTIMATED, spaced[triple["x"]])] or every
+
+
+def _beside(gyros: Sequence[dict[str, str]], accels: Sequence[dict[str, str]]) -> Sequence[dict[str, str]]:
+    """Accelerations of the gyro's own table or group; all where it has none, or where there are several gyros."""
+    own = {group_of(gyro["x"]).split("/")[0] for gyro in gyros}
+    return [accel for accel in accels if {group_of(accel["x"]).split("/")[0]} == own] or accels
 
 
 def _with_gravity(found: Sequence[dict[str, str]], columns: Columns) -> Sequence[dict[str, str]]:

@@ -1,4 +1,4 @@
-"""Spreadsheets (.xlsx, .xls): sheets as tables, together one recording or each its own.
+"""Spreadsheets (.xlsx, .xls): sheets as tables.
 
 The library holds every cell between the first and the last of a sheet, 32 bytes each, also those without a value: a cell that
 somebody left in the last row and column would be half a terabyte. So the cells of an .xlsx are counted before it is opened. An
@@ -15,12 +15,10 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from imutool.errors import ConfigError, DataError, required
+from imutool.errors import DataError, required
 
-from . import Sequence
 from ._archive import MAX_RATIO, RATIO_FREE, refusing
 from ._source import head
-from ._table_propose import propose
 from ._table_sensors import SENSORS, name_columns, pairs_among, sensors_among
 from ._table_text import Columns, is_text_table, read_csv
 
@@ -28,14 +26,12 @@ MOST_CELLS = 1 << 25  # of a sheet: a gigabyte
 LONGEST = 200  # letters of a cell that are kept
 CHUNK, ZIP = 1 << 22, b"PK"
 CELL = re.compile(rb"<(?:\w+:)?c\s[^<>]*?\br\s*=\s*[\"']([A-Za-z]{1,7})(\d{1,10})[\"']")
-LOOKED_AT = 200  # first rows, which show whether a sheet is a recording of its own
 DETAILS = r"(?i)metadata\b.*"  # sheets in which phyphox describes the phone and the times of its buttons
-IMUS = r"(?i)(imu|inertial)([ _-]?\w{1,20})?"  # a sheet of one of several sensors, recorded together
 Reader = Callable[[str, Columns, Path], None]
 
 
-def load_sheets(path: Path, columns: Columns, read: Reader, wanted: str = "") -> None:
-    """Add the columns of one sheet, or of every table in a spreadsheet as a group.
+def load_sheets(path: Path, columns: Columns, read: Reader) -> None:
+    """Add the columns of the only table in a spreadsheet, or those of each as a group.
 
     `read` adds the columns of a text.
 
@@ -43,7 +39,7 @@ def load_sheets(path: Path, columns: Columns, read: Reader, wanted: str = "") ->
         ConfigError: a library is missing; the extra is named.
         DataError: damaged, too large, or without a table.
     """
-    texts = {name: text for name, text in _sheets(path) if wanted in ("", name)}
+    texts = dict(_sheets(path))
     tables = {name: text for name, text in texts.items() if is_text_table(text.encode(), 2) and not re.fullmatch(DETAILS, name)}
     if left := ", ".join(name for name, text in texts.items() if name not in tables and text):
         columns.remarks.notes.append(f"sheets without rows of numbers, or about the recording, are left out: {left}")
@@ -62,23 +58,8 @@ def load_sheets(path: Path, columns: Columns, read: Reader, wanted: str = "") ->
         columns.take(group, part, f"sheet {name}")
 
 
-def recordings(sequence: Sequence, read: Reader) -> list[Sequence]:
-    """The spreadsheet as one recording, or each of its sheets that is an IMU by itself."""
-    alone = []
-    try:
-        for name, text in _sheets(sequence.path, least=2):
-            part, start = Columns(), "\n".join(text.split("\n", LOOKED_AT)[:LOOKED_AT])
-            if is_text_table(start.encode()):
-                read(start, part, sequence.path)
-            if part.values and propose(part).entries.keys() >= {"gyro", "accel"} and not re.fullmatch(IMUS, name):
-                alone.append(name)
-    except (ConfigError, DataError):  # said when it is read
-        return [sequence]
-    return [Sequence(f"{sequence.name} {name}", sequence.path, name) for name in alone] if len(alone) > 1 else [sequence]
-
-
-def _sheets(path: Path, least: int = 1) -> Iterator[tuple[str, str]]:
-    """Name of each sheet that is shown, and its rows as lines of text; none where there are less than `least`."""
+def _sheets(path: Path) -> Iterator[tuple[str, str]]:
+    """Name of each sheet that is shown, and its rows as lines of text."""
     calamine = required("python_calamine", "tables", package="python-calamine", where=path, user="reading it")
     if head(path).startswith(ZIP):
         status = path.stat()
@@ -86,8 +67,7 @@ def _sheets(path: Path, least: int = 1) -> Iterator[tuple[str, str]]:
     try:
         with calamine.CalamineWorkbook.from_path(str(path)) as book:
             kind = calamine.SheetTypeEnum.WorkSheet, calamine.SheetVisibleEnum.Visible
-            shown = [about.name for about in book.sheets_metadata if (about.typ, about.visible) == kind]
-            for name in shown if len(shown) >= least else ():
+            for name in [about.name for about in book.sheets_metadata if (about.typ, about.visible) == kind]:
                 rows = book.get_sheet_by_name(name).iter_rows()
                 yield name, "\n".join("\t".join(map(_text, row)) for row in rows)
     except calamine.CalamineError as error:

@@ -20,7 +20,7 @@ from imutool.recording.message_log import Remarks
 
 from ._table_dates import calendar_times, damaged_times, join_dates
 from ._table_header import header_of, note_unused_header
-from ._table_names import is_of_recordings, is_of_sensors
+from ._table_names import leaf_of, tells_apart
 from ._table_numbers import (
     COMMA_NUMBER,
     DECIMAL_COMMA,
@@ -68,6 +68,10 @@ class Columns:
     def add(self, name: str, array: Any, unit: str = "") -> None:
         """Take in an array of numbers of one, two or three dimensions."""
         array = np.asarray(array)
+        if array.dtype.kind in "UO" and array.ndim == 1 and len(array) > 1 and all(isinstance(each, str) for each in array):
+            if tells_apart(leaf_of(name)):
+                self.add_labels(name, array.tolist())
+            return
         if array.dtype.kind not in "iufb" or array.ndim > 3 or not array.size:
             return
         if array.ndim == 3:
@@ -86,6 +90,12 @@ class Columns:
         elif array.size == 1:
             self.numbers[name] = float(array.reshape(-1)[0])
 
+    def add_labels(self, name: str, texts: list[str]) -> None:
+        """Take in the texts of a column, which are lost unless they tell recordings or sensors apart."""
+        if tells_apart(leaf_of(name)):
+            self.labels[name] = texts
+        self.remarks.losses.append(no_numbers(name, texts))
+
     def unsigned(self, name: str) -> str:
         """The column that a name means: `ax` of `-ax`, which counts the other way."""
         return name if name in self.values else name.removeprefix("-")
@@ -103,6 +113,7 @@ class Columns:
             self.values[column], self.units[column] = values, other.units.get(name, "")
             if name in other.texts:
                 self.texts[column] = other.texts[name]
+        self.labels |= {f"{group}/{name}": texts for name, texts in other.labels.items()}
         self.numbers |= {f"{group}/{name}": value for name, value in other.numbers.items()}
         self.remarks.notes.extend(f"{label}: {note}" for note in other.remarks.notes)
         self.remarks.losses.extend(f"{label}: {loss}" for loss in other.remarks.losses)
@@ -230,8 +241,7 @@ def _add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> Non
             f"{name} is left out: {len(damaged)} of its fields are no times as {usual!r} is ({first})"
         )
     else:
-        columns.labels |= {name: texts} if is_of_recordings(name) or is_of_sensors(name) else {}
-        columns.remarks.losses.append(no_numbers(name, texts))
+        columns.add_labels(name, texts)
 
 
 def no_numbers(name: str, texts: list[str]) -> str:

@@ -23,7 +23,7 @@ from imutool.recording.sample_order import in_order, lost_to_set_back
 
 from . import Sequence, _unpacking
 from ._source import head, name
-from ._table_files import kind_of, load, read_text
+from ._table_files import kind_of, load
 from ._table_folder import load_split, sequences_below
 from ._table_groups import MOST_CONSTANTS, group_entries, imus_apart, pose_clock, shared_group, time_beside, turned
 from ._table_layouts import known_layout
@@ -49,7 +49,6 @@ from ._table_parts import load_table, recordings_in, refuse_joined
 from ._table_pose_names import why_no_poses
 from ._table_propose import propose
 from ._table_rotations import TURNS, known_rotations, of_angles, of_matrices, unit_by_poses
-from ._table_sheets import recordings
 from ._table_text import Columns, matrix_columns
 from ._table_times import COUNTED, begun_at_zero, count_times
 from ._table_units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
@@ -64,16 +63,10 @@ POSES_TOPIC = "/ground_truth/pose"
 def sequences(source: Path) -> list[Sequence]:
     """The source itself, if it is a table; tables in folders, or `data.hdf5`."""
     if source.is_dir():
-        return [each for found in sequences_below(source) for each in _recordings(found)]
+        return [each for found in sequences_below(source) for each in recordings_in(found)]
     if not source.exists():
         raise DataError("does not exist", where=source, expected="a file or a folder")
-    return _recordings(Sequence(name(Path(table_name(source))), source)) if kind_of(head(source), source) else []
-
-
-def _recordings(found: Sequence) -> list[Sequence]:
-    """The table, or the recordings that its sheets or its columns tell apart."""
-    is_sheets = found.path.is_file() and kind_of(head(found.path), found.path) == "sheets"
-    return recordings(found, read_text) if is_sheets else recordings_in(found)
+    return recordings_in(Sequence(name(Path(table_name(source))), source)) if kind_of(head(source), source) else []
 
 
 def recognises(sequence: Sequence) -> bool:

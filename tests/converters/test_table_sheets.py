@@ -98,11 +98,11 @@ def test_sheets_of_an_imu_and_of_true_poses_are_one_recording(tmp_path: Path) ->
 def test_sheets_that_are_an_imu_each_are_recordings_or_the_imus_of_one(imu: Imu, tmp_path: Path) -> None:
     data = [SI, *rows(imu)]
     write_xlsx(tmp_path / "day.xlsx", {"Run 1": data, "Run 2": data[:500]})
-    assert {log.name: len(log.imus["/imu0"]) for log in read(tmp_path / "day.xlsx")} == {"day Run 1": 1001, "day Run 2": 499}
+    assert {log.name: len(log.imus["/imu0"]) for log in read(tmp_path / "day.xlsx")} == {"day_Run_1": 1001, "day_Run_2": 499}
     write_xlsx(tmp_path / "body.xlsx", {"IMU_left": data, "IMU_right": data})
     (log,) = read(tmp_path / "body.xlsx")
     assert [*log.imus] == ["/imu_left/imu", "/imu_right/imu"]
-    assert sorted(sequence.name for sequence in table.sequences(tmp_path)) == ["body", "day Run 1", "day Run 2"]
+    assert sorted(sequence.name for sequence in table.sequences(tmp_path)) == ["body", "day_Run_1", "day_Run_2"]
 
 
 def test_a_cell_far_away_is_refused_before_the_library_makes_room_for_all_between(imu: Imu, tmp_path: Path) -> None:

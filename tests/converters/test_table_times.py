@@ -281,29 +281,31 @@ def test_a_clock_behind_other_columns_is_the_time(tmp_path):
     assert 'time = "column 4"\ntime_unit = "ns"\n' in refused.value.fix
 
 
-def test_recordings_in_one_structure_keep_their_own_times(tmp_path):
+def test_recordings_in_one_structure_become_logs_with_their_own_times(tmp_path):
     """Also those with as many samples, and the columns beside an IMU."""
     trial = {"t": T_S, "acc": ACCEL, "gyr": GYRO, "mag": ACCEL}
     for later, rows in ((500.0, COUNT), (90.0, COUNT - 700)):
         second = {name: values[:rows] + (later if name == "t" else 0.0) for name, values in trial.items()}
         scipy.io.savemat(tmp_path / "two.mat", {"data": {"first": trial, "second": second}})
-        log = read(tmp_path / "two.mat")
-        for name, start in (("first", 0.0), ("second", later)):
-            assert log.imus[f"/data_{name}/imu"].t_ns[0] == log.scalars[f"/data_{name}_mag_0"].t_ns[0] == start * 1e9
-        assert len(log.imus["/data_second/imu"]) == rows
+        logs = {each.name: table.read_sequence(each) for each in table.sequences(tmp_path / "two.mat")}
+        assert [*logs] == ["two_first", "two_second"]
+        for log, start in zip(logs.values(), (0.0, later), strict=True):
+            assert log.imus["/imu0"].t_ns[0] == log.scalars["/mag_0"].t_ns[0] == start * 1e9
+        assert len(log.imus["/imu0"]) == rows
 
 
-def test_one_map_holds_for_recordings_with_their_own_times(tmp_path):
+def test_one_map_holds_for_all_recordings_of_a_structure(tmp_path):
     rest = {"acc": np.tile([0.0, 0.0, 9.81], (COUNT, 1)) + RNG.normal(0.0, 0.02, (COUNT, 3)), "gyr": GYRO * 1e-3}
     two = {"first": {"t": T_S, **rest}, "second": {"t": T_S[:-9] + 40.0, **{k: v[:-9] for k, v in rest.items()}}}
     scipy.io.savemat(tmp_path / "two.mat", {"data": two})
     with pytest.raises(ConfigError, match="no unit of the gyro") as refused:
-        read(tmp_path / "two.mat")
+        table.read_sequence(table.sequences(tmp_path / "two.mat")[0])
     proposed = refused.value.fix.split("\n\n", 1)[1]
     (tmp_path / "map.toml").write_text(proposed.replace('gyro_unit = "?"', 'gyro_unit = "deg/s"'))
-    imus = read(tmp_path / "two.mat", tmp_path / "map.toml").imus
-    assert imus["/data_second/imu"].t_ns[0] == 40 * 10**9
-    assert [len(imu) for imu in imus.values()] == [COUNT, COUNT - 9]
+    found = table.sequences(tmp_path / "two.mat")
+    first, second = (table.read_sequence(each, mapping=tmp_path / "map.toml").imus["/imu0"] for each in found)
+    assert second.t_ns[0] == 40 * 10**9
+    assert [len(first), len(second)] == [COUNT, COUNT - 9]
 
 
 def test_a_table_without_any_time_is_read_by_a_map_with_a_rate(tmp_path):

@@ -1,0 +1,120 @@
+"""HDF5: arrays, records of named fields, and the cells of MATLAB's .mat files from 7.3 on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imutool.errors import DataError, required
+
+from ._table_mat import check_size
+from ._table_text import Columns
+
+MOST_CELLS = 10_000  # of a cell array
+DEEPEST = 8  # groups below a cell: one may lead to itself
+
+
+def load_hdf5(path: Path, columns: Columns) -> None:
+    """Add the columns of an HDF5 file.
+
+    Raises:
+        DataError: too large, or it holds MATLAB objects, or leads to other files.
+    """
+    h5py = required("h5py", "tables", where=path, user="reading it")
+    elsewhere: list[str] = []
+
+    def look(name: str, link: Any) -> None:  # external links are never followed
+        if isinstance(link, h5py.ExternalLink):
+            elsewhere.append(name)
+
+    def visit(name: str, node: Any) -> None:
+        if not name.startswith("#"):
+            _add_node(columns, name, node, path)
+
+    with h5py.File(path, "r") as file:
+        visit("", file)
+        file.visititems(visit)
+        file.visititems_links(look)
+    if elsewhere:
+        what = f"{', '.join(elsewhere)}: links to other files, which are not followed"
+        if not columns.values:
+            raise DataError(what, where=path, fix="Copy the arrays into this file")
+        columns.remarks.losses.append(what)
+
+
+def _add_node(columns: Columns, name: str, node: Any, path: Path) -> None:
+    """Add the numbers among the attributes of a group or an array, and the array."""
+    for key, value in node.attrs.items():
+        if np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf":
+            columns.add(f"{name}/{key}", value)
+    if "MATLAB_object_decode" in node.attrs:
+        what = f"{name} is a MATLAB object ({_plain(node.attrs.get('MATLAB_class', 'unknown'))}), not an array"
+        raise DataError(what, where=path, fix="Save it from MATLAB as arrays, or with writetable as CSV")
+    if not hasattr(node, "dtype") or node.dtype.kind not in "iufbOSV":
+        return
+    if node.external or node.is_virtual:
+        raise DataError(f"{name} lies in another file", where=path, fix="Copy it into this file")
+    check_size(path, node.size * max(8, node.dtype.itemsize))
+    if node.dtype.names:
+        records = node[()]
+        for field in node.dtype.names:
+            columns.add(f"{name}/{field}", _texts_of(records[field]))
+    elif node.dtype.kind == "O" and node.dtype.metadata and "ref" in node.dtype.metadata:
+        _add_cells(columns, name, node, path)
+    elif node.dtype.kind in "OS":
+        columns.add(name, _texts_of(node[()]))
+    elif _is_text(node):
+        columns.add(name, np.array([_word(row) for row in node[()].T]))
+    else:
+        unit = next((value for key, value in node.attrs.items() if key.lower() in ("unit", "units")), "")
+        columns.add(name, node[()], _plain(unit))
+
+
+def _add_cells(columns: Columns, name: str, node: Any, path: Path) -> None:
+    """Add the arrays and groups that a cell array, or a field of a structure's elements, leads to."""
+    if node.size > MOST_CELLS:
+        columns.remarks.losses.append(f"{name} is left out: it has {node.size} cells")
+        return
+    cells = [node.file[reference] for reference in node[()].ravel() if reference]
+    if cells and all(map(_is_text, cells)):
+        columns.add(name, np.array([_word(cell[()].T.ravel()) for cell in cells]))
+        return
+    group, _, leaf = name.rpartition("/")
+    for number, cell in enumerate(cells, 1):
+        own = f"{group}/{number}/{leaf}".lstrip("/")
+        for below, part in _nodes(cell):
+            _add_node(columns, f"{own}/{below}" if below else own, part, path)
+
+
+def _nodes(node: Any, depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """An array, or the arrays of a group, with their names below it; links are not followed."""
+    if hasattr(node, "dtype"):
+        yield "", node
+        return
+    own = [name for name in node if type(node.get(name, getlink=True)).__name__ == "HardLink"]
+    for name in own if depth < DEEPEST else ():
+        for below, part in _nodes(node[name], depth + 1):
+            yield f"{name}/{below}".rstrip("/"), part
+
+
+def _is_text(node: Any) -> bool:
+    return _plain(node.attrs.get("MATLAB_class", "")) == "char"
+
+
+def _word(codes: np.ndarray) -> str:
+    return "".join(map(chr, np.ravel(codes).tolist())).strip()
+
+
+def _texts_of(values: np.ndarray) -> np.ndarray:
+    """Bytes as texts; other values as they are."""
+    if values.dtype.kind in "OS" and all(isinstance(each, bytes) for each in values.ravel()):
+        return np.array([each.decode(errors="replace") for each in values.ravel()])
+    return values
+
+
+def _plain(attribute: Any) -> str:
+    """Text of an attribute, which MATLAB writes as bytes."""
+    return attribute.decode(errors="replace") if isinstance(attribute, bytes) else str(attribute)
