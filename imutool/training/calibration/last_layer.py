@@ -3,7 +3,8 @@
 A motion bias W u + V x is linear in W and V. A descent on batches ends about their minimum, where the batches' noise takes
 combinations that the motion hardly shows to and fro: models of five seeds differed by degrees a minute on FETCH. Least squares
 have one minimum. They are those of named effects (`imutool.training.calibration.normal_equations`): windows up to 40 s, each
-log's own rest bias and nuisances beside the shared weights, and errors as large as the logs scatter.
+log's own rest bias and nuisances beside the shared weights, and errors as large as the logs scatter. V is zero where it does not
+predict left-out logs clearly better than W alone.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from imutool.array_types import Float
 from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.training.calibration.closed_form import W_PRIOR
-from imutool.training.calibration.normal_equations import Seen, Terms, linearise
+from imutool.training.calibration.normal_equations import Seen, Terms, gain_of, linearise
 from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 
+LEAST_GAIN = 0.03  # of the judged loss, for the layer to be worth its weights
 WEIGHT_PRIOR = 0.3  # of a weight, in the unit of the curve: chosen by left-out training logs of FETCH
 
 
@@ -47,8 +49,11 @@ def solve_last_layer(model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float
     values = torch.cat([pool.of_sensor(sensor), torch.cat(inputs)], dim=1)
     corrected = replace(pool, gyro=samples) if sensor == "gyro" else replace(pool, accel=samples)
     problem = linearise(Seen(corrected, sensor, gyro), _by_axis(values), "train")
-    theta, _ = problem.solve_by_scatter(range(len(problem.theta)))
-    W, out = theta.reshape(3, -1).split((3, values.shape[1] - 3), dim=1)
+    every, width = range(len(problem.theta)), values.shape[1]
+    matrix = [k for k in every if k % width < 3]
+    losses = (problem.predicted(columns, by_scatter=True) for columns in (every, matrix))
+    columns = every if gain_of(*losses) >= LEAST_GAIN else matrix
+    W, out = problem.solve_by_scatter(columns).theta.reshape(3, width).split((3, width - 3), dim=1)
     layer.W.copy_(W)
     layer.out.copy_(out)
     return True

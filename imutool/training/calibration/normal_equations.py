@@ -126,12 +126,13 @@ class Problem:
         own: Tensor = self.own - torch.linalg.solve(H, g)
         return own
 
-    def predicted(self, columns: Sequence[int], *, by_itself: bool = False) -> Float[Tensor, " logs"]:
+    def predicted(self, columns: Sequence[int], *, by_itself: bool = False, by_scatter: bool = False) -> Float[Tensor, " logs"]:
         """Loss of each log with parameters of the other logs, or `by_itself`; its own are solved for."""
+        of_others = self.solve_by_scatter if by_scatter else self.solve
         p, losses = len(self.prior), []
         held = torch.where(torch.arange(len(self.own_prior)).to(self.prior) < self.free, 0.0, self.own_prior)
         for i, at in enumerate(self.own):
-            theta = self.alone(i).solve(columns).theta if by_itself else self.solve(columns, without=i).theta
+            theta = self.alone(i).solve(columns).theta if by_itself else of_others(columns, without=i).theta
             judged = self.judged.moved(theta - self.theta)
             H, g = judged.H[i, p:, p:] + torch.diag(held), judged.g[i, p:] + held * at
             least = RIDGE * H.diagonal().mean().clamp_min(RIDGE)
