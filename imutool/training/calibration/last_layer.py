@@ -3,7 +3,7 @@
 A motion bias W u + V x is linear in W and V. A descent on batches ends about their minimum, where the batches' noise takes
 combinations that the motion hardly shows to and fro: models of five seeds differed by degrees a minute on FETCH. Least squares
 have one minimum. They are those of named effects (`imutool.training.calibration.normal_equations`): windows up to 40 s, each
-log's own rest bias and nuisances beside the shared weights, and errors as large as the logs scatter. V is zero where it does not
+log's own rest bias and nuisances beside the shared weights, errors as large as the logs scatter. V is zero where it does not
 predict left-out logs clearly better than W alone.
 """
 
