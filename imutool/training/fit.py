@@ -2,9 +2,8 @@
 
 What a step descends on is the objective's to say (`imutool.training.objectives`), and it mixes all logs. Beside the sensor's
 weights each log has a slow track of its own rest bias, so that what belongs to a run cannot be mistaken for the sensor's. What
-is kept is the running mean over the last steps, its last layer solved for (`imutool.training.calibration.last_layer`); or the
-closed form, if that drifts less over the longest windows of the held-out part. A choice among many steps would be made by the
-noise of that part, which may be seconds long.
+is kept is the running mean over the last steps; or the closed form, if that drifts less over the longest windows of the
+held-out part. A choice among many steps would be made by the noise of that part, which may be seconds long.
 """
 
 from __future__ import annotations
@@ -136,7 +135,10 @@ class Training:
                 self._closed_form(sensor)
                 self.stage = self.begin(sensor)
             last = yield from self._descend(self.stage)
-            self.done[sensor], self.stage = self._finish(self.stage, last), None
+            better = last <= self.stage.before
+            self.model.load_state_dict(self.stage.mean.module.state_dict() if better else self.stage.closed_form)
+            self.stage.objective.settle()
+            self.done[sensor], self.stage = min(last, self.stage.before), None
         if statistics:
             self.store_statistics()
 
@@ -161,35 +163,19 @@ class Training:
         """Calibration and rest biases, as far as windows and a matrix show them."""
         rest = self.tracks.per_log().detach()
         scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
-        if sensor not in self._constant:
-            solution = closed_form.solve(scored, sensor, pool, rest, self.settings.window_s[sensor], matrix=True)
-            begin_at(self.model, sensor, solution, self.pool.sensors)
-        self._solve_constants(sensor)
-
-    def _solve_constants(self, sensor: Sensor) -> None:
-        """Constant tracks that take the nuisances of their logs: the descent knows none."""
-        rest = self.tracks.per_log().detach()
-        scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
         lengths = self.settings.window_s[sensor]
-        self.tracks.set(sensor, closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, nuisances=False).rest)
-
-    def _finish(self, stage: Stage, last: float) -> float:
-        """Keep what the descent left, with its last layer solved for, or the closed form; its held-out error."""
-        sensor = stage.sensor
-        if last <= stage.before:
-            self.model.load_state_dict(stage.mean.module.state_dict())
-            if solve_last_layer(self.model.eval(), sensor, self.pool, self.tracks.per_log().detach()):
-                self._solve_constants(sensor)
-                last = self.held_out(sensor, self.model)
-        if last > stage.before:
-            self.model.load_state_dict(stage.closed_form)
-            self._solve_constants(sensor)
-        stage.objective.settle()
-        return min(last, stage.before)
+        if sensor not in self._constant:
+            solution = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=True)
+            begin_at(self.model, sensor, solution, self.pool.sensors)
+            solve_last_layer(self.model, sensor, self.pool, rest)
+        # constants that take the nuisances of their logs: the descent knows none
+        scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
+        constants = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, nuisances=False)
+        self.tracks.set(sensor, constants.rest)
 
     def begin(self, sensor: Sensor) -> Stage:
         """Fresh stage from the current model and tracks: it moves the sensor's weights and the tracks."""
-        weights = {name: w for name, w in self.model.named_parameters() if f".{sensor}" in f".{name}"}
+        weights = self._moved(sensor)
         free = [w for name, w in weights.items() if name.startswith(self.model.undecayed)]
         groups = [
             ([w for name, w in weights.items() if not name.startswith(self.model.undecayed)], self.settings.weight_decay),
@@ -200,6 +186,11 @@ class Training:
         mean = AveragedModel(self.model.eval(), multi_avg_fn=average, use_buffers=True)
         objective = OBJECTIVES[self.model.objective](self.model, sensor, self.pool, self.tracks, self.settings)
         return Stage(sensor, AdamW(groups), mean, objective)
+
+    def _moved(self, sensor: Sensor) -> dict[str, Tensor]:
+        """Weights of a sensor that a descent moves: those that no closed form gives."""
+        named = {name: w for name, w in self.model.named_parameters() if f".{sensor}" in f".{name}"}
+        return {name: w for name, w in named.items() if w.requires_grad}
 
     def _rate(self, sensor: Sensor) -> float:
         return self.settings.gyro_rate if sensor == "gyro" else self.settings.accel_rate
@@ -219,7 +210,7 @@ class Training:
             loss = self._one_step(stage)
 
     def _steps(self, sensor: Sensor) -> int:
-        return self.settings.steps if self.model.iterative else 0
+        return self.settings.steps if self.model.iterative and self._moved(sensor) else 0
 
     def _rate_at(self, stage: Stage) -> float:
         sensor, warm = stage.sensor, min(1.0, (stage.step + 1) / WARM_UP_STEPS)

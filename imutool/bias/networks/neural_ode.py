@@ -42,6 +42,7 @@ class Curve(nn.Module):
             nn.init.normal_(layer.weight, 0.0, layer.in_features**-0.5)
         nn.init.zeros_(layers[2].weight)
         self.net = nn.Sequential(layers[0], nn.GELU(), layers[1], nn.Tanh(), layers[2])
+        self.requires_grad_(False)  # the layers below stay as drawn, W and the last one are solved for in closed form
 
     def forward(self, u: Float[Tensor, "*batch 3"], slow: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Motion-dependent bias: `u` the samples, `slow` the filtered ones."""
@@ -115,9 +116,10 @@ class Network(BiasNetwork):
         return motion
 
     def last_layer(self, sensor: Sensor) -> LastLayer | None:
-        """Last layer of the curve; none of one that no descent has shaped, and none in the paper's scheme."""
-        if self.config.paper or not bool((curve := _part(self.curve, sensor, Curve)).net[-1].weight.any()):
+        """Last layer of the curve; the paper's scheme has none."""
+        if self.config.paper:
             return None
+        curve = _part(self.curve, sensor, Curve)
 
         def inputs(segment: Segment) -> Float[Tensor, "batch n width"]:
             u, _ = segment.of(sensor)
