@@ -336,6 +336,7 @@ def test_converting_needs_no_torch():
         (b'<?xml version="1.0" encoding="UTF-8"?>\n<mvnx version="4">', "Xsens MVN.*sensors measured"),
         (b"\x80\x04\x95\x0f\x00\x00\x00\x00\x00\x00\x00}\x94\x8c\x03acc\x94K\x01s.", "pickle of Python.*numpy.savez"),
         (b"\x02P,\x00", "C3D file.*beside the table"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:5f5b\nsize 42586\n", "pointer of Git LFS.*git lfs pull"),
         (b"neither one nor the other", "no sequence found; expected a ROS bag"),
     ],
 )
@@ -343,6 +344,14 @@ def test_a_format_that_is_known_but_not_read_says_what_to_do(start: bytes, said:
     (tmp_path / "flight.dat").write_bytes(start + bytes(3000))
     with pytest.raises(DataError, match=said):
         convert(tmp_path / "flight.dat", tmp_path / "out.mcap")
+
+
+def test_a_folder_without_a_recording_says_of_which_format_most_of_its_known_files_are(tmp_path: Path) -> None:
+    for number in (1, 2, 3):
+        (tmp_path / f"imu{number}.mat").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:5f5b\nsize 4\n")
+    (tmp_path / "film.mp4").write_bytes(b"\x00\x00\x00\x14ftypmp41" + bytes(100))
+    with pytest.raises(DataError, match=r"of imu1\.mat and 2 others, it is a pointer of Git LFS.*git lfs pull"):
+        convert(tmp_path, tmp_path / "out")
 
 
 def test_a_folder_of_own_logs_alone_can_be_converted_again_but_never_what_it_wrote_itself(source, tmp_path):
