@@ -14,7 +14,7 @@ import scipy.io
 from support.spreadsheet import write_xlsx
 from support.tables import write_csv
 
-from imutool.converters import table
+from imutool.converters import _table_parts, table
 
 COUNT, PARTS, RATE_HZ = 200, 3, 50.0
 RNG = np.random.default_rng(7)
@@ -318,3 +318,16 @@ def test_a_folder_finds_files_that_hold_several_recordings(tmp_path: Path) -> No
         *(f"one_trial_{n}" for n in (1, 2, 3)),
         *(f"two_trial{n}" for n in (1, 2, 3)),
     ]
+
+
+@pytest.mark.parametrize("write", [as_npz, as_mat, as_hdf5])
+def test_arrays_that_can_be_of_one_recording_alone_are_not_read_to_list_it(
+    tmp_path: Path, write: Callable[[Path, Arrays], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"one.{ENDINGS.get(write, 'mat')}"
+    write(path, {"time_s": T_S[:COUNT]} | {name: each[:COUNT] for name, each in NAMES.items()})
+    monkeypatch.setattr(_table_parts, "load", lambda *_: pytest.fail("read"))
+    assert [each.name for each in table.sequences(path)] == ["one"]
+    write(path, {"trial": PART} | NAMES)
+    with pytest.raises(pytest.fail.Exception, match="read"):
+        table.sequences(path)
