@@ -87,7 +87,7 @@ def load(path: Path, kind: str) -> Columns:
 
 
 def may_hold_several(path: Path) -> bool:
-    """Whether a table may hold several recordings or sensors, by names of its columns and groups.
+    """Whether the names in a file may be of several recordings or sensors.
 
     JSON and spreadsheets may: theirs are not known before all is read.
     """
