@@ -78,7 +78,7 @@ def _sequences_in(folder: Path) -> list[Sequence]:
     if kind_of(head(folder / DATA_FILE), folder / DATA_FILE) == "hdf5":
         return [Sequence(folder.name, folder / DATA_FILE)]
     found = {} if is_phone(folder) else _recordings(folder)
-    places = {name: (*tables, "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
+    places = {name: (next(iter(tables)), "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
     return [Sequence(folder.name if len(found) == 1 else name, *place) for name, place in places.items()]
 
 
