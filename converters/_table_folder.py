@@ -32,6 +32,7 @@ from ._table_packed import read_bytes, table_name
 from ._table_sensors import SENSORS, SPACED, WORD, name_columns, pairs_among, plain_among, sensors_among
 from ._table_text import LOOKED_AT, Columns, is_text_table, read_csv, text_of
 from ._table_times import rises
+from .px4_csv import logs_in
 from .sensor_tables import is_phone
 
 MOST_TABLES = 40  # of one recording
@@ -78,11 +79,11 @@ def _sequences_in(folder: Path) -> list[Sequence]:
     """Recordings of a folder: `data.hdf5`, or its tables together, in pairs or one by one.
 
     Together are tables of a gyroscope and an accelerometer, of several such pairs, or of one IMU and of poses: all of the
-    folder, or those whose names differ in that alone (`walk_imu`, `walk_gt`). None are of a phone app.
+    folder, or those whose names differ in that alone (`walk_imu`, `walk_gt`). None are of a phone app or of PX4.
     """
     if kind_of(head(folder / DATA_FILE), folder / DATA_FILE) == "hdf5":
         return [Sequence(folder.name, folder / DATA_FILE)]
-    found = {} if is_phone(folder) else _recordings(folder)
+    found = {} if is_phone(folder) or logs_in(folder) else _recordings(folder)
     places = {name: (tables[0], "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
     return [Sequence(folder.name if len(found) == 1 else name, *place) for name, place in places.items()]
 

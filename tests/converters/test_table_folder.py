@@ -166,7 +166,7 @@ def test_of_a_table_of_one_sensor_x_y_and_z_are_the_axes(tmp_path):
     t_us, zero = 1e6 * T_S, np.zeros((COUNT, 3))
     for sensor, values in (("gyro", GYRO), ("accel", ACCEL)):
         columns = np.column_stack([t_us, t_us - 100, zero, values])
-        np.savetxt(tmp_path / f"sensor_{sensor}_0.csv", columns, header=",".join(names), delimiter=",", comments="")
+        np.savetxt(tmp_path / f"my_{sensor}_0.csv", columns, header=",".join(names), delimiter=",", comments="")
     (sequence,) = table.sequences(tmp_path)
     with pytest.raises(ConfigError) as refused:
         table.read_sequence(sequence)
