@@ -25,7 +25,7 @@ from ._table_files import kind_of, load, npy_shape, read_npy
 from ._table_geodetic import add_local
 from ._table_groups import TRUE_GROUPS
 from ._table_header import MOSTLY
-from ._table_look import look, span_ns
+from ._table_look import MOST_LARGER, look, recorded_apart
 from ._table_map import IMU_GROUP, POSES_GROUP, TRUTH_GROUP
 from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_packed import read_bytes, table_name
@@ -36,7 +36,6 @@ from .px4_csv import logs_in
 from .sensor_tables import is_phone
 
 MOST_TABLES = 40  # of one recording
-MOST_LARGER = 1.2  # ratio of the sizes of files of IMUs that were recorded together
 DATA_FILE = "data.hdf5"  # of RoNIN
 IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of UZH-FPV's imu.txt; else its columns show it
 IMUS = r"(imu|inertial)[ _-]?\w{1,20}"  # of several beside one file of poses: imu_1, imu_left
@@ -151,8 +150,8 @@ def _is_time(path: Path) -> bool:
 def _recordings(folder: Path) -> dict[str, list[Path]]:
     """Tables of each recording of a folder, by its name; the name is empty where all tables are one recording."""
     tables = _tables(folder)
-    if groups := _groups(tables[:MOST_TABLES]):
-        parts = _apart_in_time(groups) if groups.keys() == {*tables} else []
+    if groups := _groups(tables) or _groups(tables[:MOST_TABLES]):
+        parts = recorded_apart(groups, tables)
         if len(parts) > 1:
             return {_without_role(_stem(min(part))): sorted(part) for part in parts}
         return {"": tables[:MOST_TABLES]}
@@ -169,24 +168,6 @@ def _recordings(folder: Path) -> dict[str, list[Path]]:
         own = {stems[path]: [path] for path in paths if look(path).is_imu or look(path).header in of_imus}
         found |= {name: paths} if name and _groups(paths) else own
     return found or {stems[path]: [path] for path in tables if look(path).may_be_imu}
-
-
-def _apart_in_time(groups: dict[Path, str]) -> list[list[Path]]:
-    """Tables of IMUs, those together that were recorded at one time; none where a table does not show its time."""
-    pairs: dict[str, list[Path]] = {}
-    for path, group in groups.items():
-        pairs.setdefault(group.rpartition("/")[0], []).append(path)
-    spans = {path: span_ns(path) for path in groups if path.is_file()} if len(pairs) > 1 else {}
-    known = {path: span for path, span in spans.items() if span}
-    if not known or known.keys() != groups.keys():
-        return []
-    parts, end = list[list[Path]](), 0
-    for pair in sorted(pairs.values(), key=lambda each: min(known[path] for path in each)):
-        if min(known[path][0] for path in pair) > end:
-            parts.append([])
-        parts[-1] += pair
-        end = max(end, *(known[path][1] for path in pair))
-    return parts
 
 
 def _without_role(stem: str) -> str:

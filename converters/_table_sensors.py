@@ -21,8 +21,8 @@ from ._table_text import COMMENTS, Columns, read_csv
 from ._table_times import rises
 
 SENSORS = {  # words in the names of files and of sensors
-    "gyro": r"gyr|gyros?|gyroscopes?|gyroskop|giroscopio|giroscopo",
-    "accel": r"acc[el]?|accels?|accelerometers?|accelerations?|acelerometro|accelerometre|beschleunigung(ssensor)?",
+    "gyro": r"gyrm?|gyros?|gyroscopes?|gyroskop|giroscopio|giroscopo",
+    "accel": r"acc[elm]?|accels?|accelerometers?|accelerations?|acelerometro|accelerometre|beschleunigung(ssensor)?",
 }
 OTHERS = r"bias|biases|calib|calibration|linear|linea[lr]|user|gravity|noise|allan|stride|labels?"
 UNCORRECTED = r"uncal|uncalib|uncalibrated|raw|ref|reference"  # taken where nothing else is there: not calibrated, or ideal
