@@ -88,8 +88,9 @@ def spread_stamps(t_ns: Int64[np.ndarray, " n"], starts: Int64[np.ndarray, " s"]
 
     ahead = placed(np.append(steps, np.inf) / count, behind)
     back = placed(np.append(np.inf, steps) / count, behind - each + 1)
-    of_row = np.repeat(usual, count)[1:]
-    uneven = [np.minimum(np.abs(np.diff(stamps) / of_row - 1.0), 1.0).sum() for stamps in (ahead, back)]
+    moved = np.diff(ahead) != np.diff(back)
+    of_row = np.repeat(usual, count)[1:][moved]
+    uneven = [np.minimum(np.abs(np.diff(stamps)[moved] / of_row - 1.0), 1.0).sum() for stamps in (ahead, back)]
     is_back = bool(uneven[1] < CLEARLY * uneven[0] - 1.0)
     return (back if is_back else ahead), is_back
 
