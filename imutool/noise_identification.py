@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from imutool.array_types import Float64
+from imutool.bias_start.stretches import without_vectors
 from imutool.config import build
 from imutool.errors import DataError
 from imutool.file_location import Location
@@ -24,6 +25,7 @@ from imutool.noise import allan
 from imutool.noise import datasheet as noise
 from imutool.noise.allan import Curve, Slopes
 from imutool.noise.datasheet import UNITS, Noise
+from imutool.processes.system import release_memory
 from imutool.recording import Imu, Recording
 from imutool.units import SENSORS, Sensor
 
@@ -88,7 +90,8 @@ def identify(
     path, recording = log.path, longest_recording(read_recordings(log, imu=imu, truth=truth))
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
-    recording, remarks = in_si_units(recording)
+    recording, remarks = in_si_units(without_vectors(recording))
+    release_memory()
     rest = _at_rest(recording.imu, remarks)
     motion = None
     if recording.truths:
@@ -166,15 +169,21 @@ def _by_fit(recording: Recording) -> tuple[Imu, str]:
     from imutool.training.training_windows import Pool
 
     pool = Pool.of([recording])
+    release_memory()
     model = static.Network(rate_hz=pool.rate_hz).double()
     rest = torch.zeros(1, 6, dtype=torch.float64)
-    corrected = []
-    for column, sensor in enumerate(SENSORS):
-        u = getattr(recording.imu, sensor)
+    matrices = []
+    for k, sensor in enumerate(SENSORS):
         solution = closed_form.solve(model, sensor, pool, rest, WINDOWS_S[sensor], matrix=True, part="all")
-        rest[:, 3 * column : 3 * column + 3] = solution.rest
-        corrected.append(u - u @ solution.W.numpy().T - solution.rest.numpy())
-    return Imu(recording.imu.t_ns, *corrected), "corrected by a matrix and a constant fitted to it"
+        rest[:, 3 * k : 3 * k + 3] = solution.rest
+        matrices.append(solution.W.numpy())
+    del pool  # no array as long as the log stays when it is no longer needed
+    release_memory()
+    gyro, accel = (u - u @ W.T for u, W in zip((recording.imu.gyro, recording.imu.accel), matrices, strict=True))
+    for u, constant in ((gyro, rest[0, :3]), (accel, rest[0, 3:])):
+        np.subtract(u, constant.numpy(), out=u)
+        u.flags.writeable = False  # so that the samples need no copy
+    return Imu(recording.imu.t_ns, gyro, accel), "corrected by a matrix and a constant fitted to it"
 
 
 def _combine(

@@ -167,7 +167,7 @@ def pairs_by_distance(
     grows (evo searches every pair, minutes for 30 000 poses).
     """
     travelled = np.concatenate([[0.0], np.cumsum(quaternion.length(np.diff(p, axis=0)))])
-    pairs = [np.zeros((2, 0), np.int64)]
+    pairs, count = np.empty((2, max(len(p) - 1, 0)), np.int64), 0
     for first in range(0, len(p) - 1, AT_ONCE):
         i = np.arange(first, min(first + AT_ONCE, len(p) - 1))
         above = np.searchsorted(travelled, travelled[i] + distance_m, side="left")
@@ -178,8 +178,9 @@ def pairs_by_distance(
         miss_below = np.abs(travelled[below] - travelled[i] - distance_m)
         j = np.where(miss_below <= miss_above, below, above)
         near = np.minimum(miss_below, miss_above) <= distance_m * tolerance
-        pairs.append(np.stack([i[near], j[near]]))
-    i, j = np.concatenate(pairs, axis=1)
+        pairs[:, count : count + int(near.sum())] = i[near], j[near]
+        count += int(near.sum())
+    i, j = pairs[:, :count]
     return i, j
 
 
