@@ -148,39 +148,29 @@ def _evaluated(
             logger.warning("%s: %s", recording.name, gaps)
         if aids is not None:
             estimates[AIDED] = aided_path(corrected.rows(rows), StartPose.of(true), residual_prior(start, std), aids)
-        scores = []
+        how = {"init": init if start else None, "init_how": start.how if start else None, "smooth": smooth}
+        scores = list[dict[str, Any]]()
         for kind, estimate in estimates.items():
-            scores.append(
-                {
-                    "log": recording.name,
-                    "model": name,
-                    "estimate": kind,
-                    "aids": aids.signals if aids and kind == AIDED else {},
-                    "init": init if start else None,
-                    "init_how": start.how if start else None,
-                    "smooth": smooth,
-                    "fit": fit and to_builtins(fit),
-                    **metrics.evaluate(estimate, true, valid),
-                }
-            )
+            of = {
+                "log": recording.name,
+                "model": name,
+                "estimate": kind,
+                "aids": aids.signals if aids and kind == AIDED else {},
+            }
+            scores.append(of | how | {"fit": fit and to_builtins(fit)} | metrics.evaluate(estimate, true, valid))
             if trajectories is not None:
                 if (name, kind) == (RAW, PURE):
                     metrics.write_trajectory(true.rows(valid), trajectories, recording.name, "truth", overwrite)
                 label = name if kind == PURE else f"{name}_{kind}"
                 metrics.write_trajectory(estimate.rows(valid), trajectories, recording.name, label, overwrite)
         del estimates, estimate
-        means = trapezoidal(corrected)
-        del corrected
-        release_memory()
-        drifted, delay = _drifts(means, (rows, true, valid), recording, model, start)
+        corrected = trapezoidal(corrected)  # now means of each sample and the next
+        drifted, delay = _drifts(corrected, (rows, true, valid), recording, model, start)
         del true, valid
-        after = drifted | _without_delay(delay, means, recording, drifted[DRIFTS[0]])
-        after |= {
-            "gyro_bias": start.rest[:3].tolist() if start else [0.0, 0.0, 0.0],
-            "accel_bias": start.rest[3:].tolist() if start else [0.0, 0.0, 0.0],
-        }
-        results += [score | after for score in scores]
-        del means
+        drifted |= _without_delay(delay, corrected, recording, drifted[DRIFTS[0]])
+        bias = np.zeros(6) if start is None else start.rest
+        results += [score | drifted | {"gyro_bias": bias[:3].tolist(), "accel_bias": bias[3:].tolist()} for score in scores]
+        del corrected
     return results
 
 

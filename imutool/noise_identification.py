@@ -30,8 +30,6 @@ from imutool.recording import Imu, Recording
 from imutool.units import SENSORS, Sensor
 
 KINDS = ("density", "walk", "instability")  # of each sensor, as `Noise` has them
-LEAST_FREEDOM = 10.0  # degrees of freedom that an averaging time needs to bound a density from above
-BOUND_RISK = 0.002  # probability that one averaging time puts the bound too low
 SHORT = 2.5  # samples: over longer windows vibration averages out, and no longer bounds the residual from below
 DEPENDENT_TRUTH = 0.25  # of a sample's white noise: an independent truth differs by more
 EXPLAINED = 3.0  # times a sample's white noise: a larger residual comes from the truth or the calibration
@@ -101,10 +99,10 @@ def identify(
             remarks.append(f"in motion: {error.what}")
     else:
         remarks.append("in motion: the log has no true poses")
-    root_s = np.sqrt(recording.imu.period_s)
-    samples = {sensor: white_noise(getattr(recording.imu, sensor)) * root_s for sensor in SENSORS}
-    at_most = {sensor: _bound(rest.curves[sensor]) if rest is not None else UNKNOWN for sensor in SENSORS}
-    combined = _combine(rest, motion, samples, at_most, recording.imu.period_s, remarks)
+    period_s = recording.imu.period_s
+    samples = {sensor: white_noise(getattr(recording.imu, sensor)) * np.sqrt(period_s) for sensor in SENSORS}
+    at_most = {sensor: allan.density_bound(rest.curves[sensor]) if rest is not None else UNKNOWN for sensor in SENSORS}
+    combined = _combine(rest, motion, samples, at_most, period_s, remarks)
     if rest is None and motion is None:
         raise DataError(
             f"the log shows no noise: {'; '.join(remarks)}",
@@ -116,8 +114,7 @@ def identify(
 
 
 def _at_rest(imu: Imu, remarks: list[str]) -> CurveSource | None:
-    stretches = rest_stretches(imu)
-    if not stretches:
+    if not (stretches := rest_stretches(imu)):
         remarks.append("at rest: the log never rests")
         return None
     parts = [imu.rows(slice(*bounds)) for bounds in stretches]
@@ -177,13 +174,11 @@ def _by_fit(recording: Recording) -> tuple[Imu, str]:
         solution = closed_form.solve(model, sensor, pool, rest, WINDOWS_S[sensor], matrix=True, part="all")
         rest[:, 3 * k : 3 * k + 3] = solution.rest
         matrices.append(solution.W.numpy())
-    del pool  # no array as long as the log stays when it is no longer needed
+    del pool
     release_memory()
-    gyro, accel = (u - u @ W.T for u, W in zip((recording.imu.gyro, recording.imu.accel), matrices, strict=True))
-    for u, constant in ((gyro, rest[0, :3]), (accel, rest[0, 3:])):
-        np.subtract(u, constant.numpy(), out=u)
-        u.flags.writeable = False  # so that the samples need no copy
-    return Imu(recording.imu.t_ns, gyro, accel), "corrected by a matrix and a constant fitted to it"
+    columns = zip((recording.imu.gyro, recording.imu.accel), matrices, rest.numpy().reshape(2, 3), strict=True)
+    corrected = [u - u @ W.T - constant for u, W, constant in columns]
+    return Imu(recording.imu.t_ns, *corrected), "corrected by a matrix and a constant fitted to it"
 
 
 def _combine(
@@ -242,19 +237,6 @@ def _well_determined(
         )
     bounds = [np.inf if value is None else value for value in at_most]
     return [bool(r <= EXPLAINED and d <= bound) for r, d, bound in zip(ratio, density, bounds, strict=True)]
-
-
-def _bound(curve: Curve) -> list[float | None]:
-    """Upper bound of the white density by axis: least of deviation * sqrt(tau) with its confidence."""
-    from scipy.special import gammaincinv
-
-    enough = curve.freedom >= LEAST_FREEDOM
-    if not enough.any():
-        return UNKNOWN
-    freedom = curve.freedom[enough]
-    stretch = np.sqrt(freedom / (2.0 * gammaincinv(freedom / 2.0, BOUND_RISK)))  # the quantile of chi²
-    bounds = curve.deviation[enough] * (np.sqrt(curve.tau_s[enough]) * stretch)[:, None]
-    return [float(value) for value in bounds.min(axis=0)]
 
 
 def _duration(seconds: float) -> str:

@@ -139,7 +139,10 @@ def matrix_from_quaternion_wxyz(q_wxyz: Quaternions) -> Rotations:
 
 
 def matrices_from_rows_wxyz(q_wxyz: Float64[np.ndarray, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Rotations of many quaternions, in blocks: the steps of all at once take four times the memory of the result."""
+    """Rotations of many quaternions, in blocks.
+
+    The steps of all at once take four times the memory of the result.
+    """
     R = torch.empty(len(q_wxyz), 3, 3, dtype=torch.float64)
     for first in range(0, len(q_wxyz), ROWS_AT_ONCE):
         rows = slice(first, first + ROWS_AT_ONCE)

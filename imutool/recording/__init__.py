@@ -114,11 +114,7 @@ class Poses(Columns):
         start = int(self.t_ns[0])
         knots, wanted = seconds(self.t_ns, start), seconds(clipped, start)
         share = (clipped - self.t_ns[after - 1]) / span_ns
-        q_wb_wxyz = np.empty((len(t_ns), 4))
-        for first in range(0, len(t_ns), quaternion.ROWS_AT_ONCE):
-            rows = slice(first, first + quaternion.ROWS_AT_ONCE)
-            before, behind = (self.q_wb_wxyz[index] for index in (after[rows] - 1, after[rows]))
-            q_wb_wxyz[rows] = quaternion.unit(quaternion.slerp(before, behind, share[rows]))
+        q_wb_wxyz = quaternion.between_rows(self.q_wb_wxyz, after, share)
         p_wb = _interpolate(wanted, knots, self.p_wb)
         v_w = None if self.v_w is None else _interpolate(wanted, knots, self.v_w)
         for column in (q_wb_wxyz, p_wb, *([] if v_w is None else [v_w])):  # so that the poses need no copy
@@ -301,7 +297,4 @@ def unit_quaternions(q_wxyz: Float64[np.ndarray, "n 4"], tolerance: float = 1e-2
 def _interpolate(
     t: Float64[np.ndarray, " n"], knots: Float64[np.ndarray, " m"], values: Float64[np.ndarray, "m k"]
 ) -> Float64[np.ndarray, "n k"]:
-    out = np.empty((len(t), values.shape[1]))
-    for column, known in zip(out.T, values.T, strict=True):
-        column[:] = np.interp(t, knots, known)
-    return out
+    return np.stack([np.interp(t, knots, column) for column in values.T], axis=1)
