@@ -150,7 +150,10 @@ def slerp(a: Quaternions, b: Quaternions, share: Column) -> Quaternions:
 
 
 def between_rows(q: Float64[np.ndarray, "m 4"], after: Int64[np.ndarray, " n"], share: Column) -> Quaternions:
-    """Unit quaternions between the rows before `after` (share 0) and these (share 1), by slerp in blocks."""
+    """Unit quaternions between rows, by slerp in blocks.
+
+    From the row before `after` (share 0) to the row `after` (share 1).
+    """
     out = np.empty((len(after), 4))
     for first in range(0, len(after), ROWS_AT_ONCE):
         rows = slice(first, first + ROWS_AT_ONCE)
