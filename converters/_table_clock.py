@@ -53,6 +53,7 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
     others = [c for c in found if length not in (None, len(columns.values[c])) and rises(columns.values[c])]
     found = [c for c in found if length in (None, len(columns.values[c]))]
     still, found = [c for c in found if not goes_on(columns.values[c])], [c for c in found if goes_on(columns.values[c])]
+    found.sort(key=lambda c: in_batches(columns.values[c]))
     if gyro:
         found.sort(key=lambda c: (_table_of(c) != _table_of(gyro[0]), -shared_group(c, gyro[0])))
         found.sort(key=lambda c: not re.match(OWN_TIME["gyro"], spelled[c][1]))
@@ -65,9 +66,6 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
         measured = {*counters, *gyro, *proposal.unsigned("accel", columns)}
         why, found = _unnamed_time(names, columns, counters, [c for c in names if c not in measured], length)
         proposal.reasons += [f"{column!r} {why}: it counts as the time" for column in found]
-    if not found and (found := [c for c in still if in_batches(columns.values[c])][:1]):
-        several = len(columns.values[found[0]]) / len(np.unique(columns.values[found[0]]))
-        proposal.reasons.append(f"{found[0]!r} has a stamp for {several:.3g} rows each in the mean")
     if not found:
         proposal.reasons += [f"{c!r} rises and has {len(columns.values[c])} rows, and the gyro {length}" for c in others]
         for column in still:
@@ -78,6 +76,9 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
         _propose_rate(proposal, columns, next(iter(counters), ""), length)
         return
     column = proposal.entries["time"] = found[0]
+    if in_batches(columns.values[column]):
+        several = len(columns.values[column]) / len(np.unique(columns.values[column]))
+        proposal.reasons.append(f"{column!r} has a stamp for {several:.3g} rows each in the mean")
     if re.match(OWN_TIME["gyro"], spelled[column][1]):
         own = [c for c in found if re.match(OWN_TIME["accel"], spelled[c][1]) and names[c][1] == names[column][1]]
         proposal.entries |= {"accel_time": own[0]} if own else {}

@@ -15,13 +15,13 @@ from imutool.errors import DataError, required
 from ._archive import refusing
 from ._source import head
 from ._table_echo import of_echo
-from ._table_hdf5 import load_hdf5
+from ._table_hdf5 import load_hdf5, names_of_hdf5
 from ._table_headerless import as_table, name_headerless
 from ._table_json import is_json, load_json
-from ._table_mat import check_size, load_mat
+from ._table_mat import check_size, load_mat, names_of_mat
 from ._table_merged import join_stamps, sort_by_clock
 from ._table_mocap import is_mocap, read_mocap
-from ._table_names import tells_apart
+from ._table_names import group_of, leaf_of, tells_apart
 from ._table_numbers import is_number
 from ._table_packed import read_bytes, text_head
 from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated
@@ -30,7 +30,6 @@ from ._table_sheets import load_sheets
 from ._table_text import FIRSTS, WIDEST, Columns, is_text_table, read_csv, text_of
 from ._table_times import join_gps_weeks, read_serial_days
 
-OF_ARRAYS = "json", "npz", "mat", "hdf5", "sheets"  # kinds of files that hold tables or arrays of several lengths
 NO_NUMBERS = "holds no columns of numbers"
 MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own in HDF5
     "hdf5": b"\x89HDF\r\n\x1a\n",
@@ -88,22 +87,27 @@ def load(path: Path, kind: str) -> Columns:
 
 
 def may_hold_several(path: Path) -> bool:
-    """Whether a table may hold several recordings or sensors, by its kind or its columns' names."""
+    """Whether the names in a file may be of several recordings or sensors.
+
+    JSON and spreadsheets may: theirs are not known before all is read.
+    """
     kind = kind_of(head(path), path)
-    return kind in OF_ARRAYS or any(map(tells_apart, _names_of(path, kind)))
+    names = _names_of(path, kind)
+    in_groups = kind in OF_GROUPS and len({*map(group_of, names)} | {""}) > 2
+    return kind in ("json", "sheets") or in_groups or any(tells_apart(leaf_of(name)) for name in names)
 
 
 def _names_of(path: Path, kind: str) -> list[str]:
-    """Names of the columns of a table of text, Parquet or Feather; fields of further rows may be among them."""
+    """Names of the columns or arrays of a table; of text fields of further rows may be among them."""
     if kind == "csv":
         lines = text_of(text_head(path)).splitlines()[:FIRSTS]
         return [field.strip(' "#') for line in lines for field in re.split(r"[;,\t]", line) if not is_number(field)]
-    if kind in ("parquet", "feather"):
-        with refusing(path), path.open("rb") as source:
-            if kind == "parquet":
-                return list(_module("pyarrow.parquet", path).ParquetFile(source).schema_arrow.names)
+    with refusing(path), path.open("rb") as source:
+        if kind == "parquet":
+            return list(_module("pyarrow.parquet", path).ParquetFile(source).schema_arrow.names)
+        if kind == "feather":
             return list(_module("pyarrow.ipc", path).open_file(source).schema.names)
-    return []
+        return OF_GROUPS[kind](path) if kind in OF_GROUPS else []
 
 
 def _members(path: Path) -> set[str]:
@@ -238,6 +242,11 @@ def _module(name: str, path: Path) -> Any:
     return required(name, "tables", where=path, user="reading it")
 
 
+OF_GROUPS: dict[str, Callable[[Path], list[str]]] = {  # names of the arrays, with their groups
+    "npz": lambda path: [name.removesuffix(".npy") for name in _members(path)],
+    "mat": names_of_mat,
+    "hdf5": names_of_hdf5,
+}
 LOADERS: dict[str, Callable[[Path, Columns], None]] = {
     "csv": _load_csv,
     "json": load_json,

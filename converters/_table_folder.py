@@ -24,7 +24,7 @@ from ._source import find_folders, head
 from ._table_files import kind_of, load, npy_shape, read_npy
 from ._table_geodetic import add_local
 from ._table_header import MOSTLY
-from ._table_look import look, span_ns
+from ._table_look import look, recorded_apart
 from ._table_map import POSES_GROUP, TRUTH_GROUP
 from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_packed import read_bytes, table_name
@@ -32,6 +32,7 @@ from ._table_roles import Names, role_folders, role_groups, shared_names, withou
 from ._table_sensors import SENSORS, name_columns, sensors_among
 from ._table_text import LOOKED_AT, Columns, is_text_table, read_csv, text_of
 from ._table_times import rises
+from .px4_csv import logs_in
 from .sensor_tables import is_phone
 
 MOST_TABLES = 40  # of one recording
@@ -73,12 +74,13 @@ def _sequences_in(folder: Path) -> list[Sequence]:
     """Recordings of a folder: `data.hdf5`, or its tables together, in pairs or one by one.
 
     Together are tables of a gyroscope and an accelerometer, of several such pairs, or of one IMU and of poses: all of the
-    folder, or those whose names differ in that alone (`walk_imu`, `walk_gt`; `imu/walk`, `gt/walk`). None are of a phone app.
+    folder, or those whose names differ in that alone (`walk_imu`, `walk_gt`; `imu/walk`, `gt/walk`). None are of a phone app
+    or of PX4.
     """
     if kind_of(head(folder / DATA_FILE), folder / DATA_FILE) == "hdf5":
         return [Sequence(folder.name, folder / DATA_FILE)]
-    found = {} if is_phone(folder) else _recordings(folder)
-    places = {name: (*tables, "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
+    found = {} if is_phone(folder) or logs_in(folder) else _recordings(folder)
+    places = {name: (next(iter(tables)), "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
     return [Sequence(folder.name if len(found) == 1 else name, *place) for name, place in places.items()]
 
 
@@ -160,8 +162,8 @@ def _recordings(folder: Path) -> dict[str, Names]:
     roles = {path: f"{path.relative_to(folder).parts[0]}_" if path.parent != folder else "" for path in stems}
     names = {path: roles[path] + stem for path, stem in stems.items()}
     first = dict(islice(names.items(), MOST_TABLES))
-    if groups := role_groups(first):
-        parts = _apart_in_time(groups) if groups.keys() == names.keys() else []
+    if groups := role_groups(names) or role_groups(first):
+        parts = recorded_apart(groups, list(names))
         if len(parts) > 1:
             return {without_role(stems[min(part)]): {path: names[path] for path in sorted(part)} for part in parts}
         return {"": first}
@@ -181,24 +183,6 @@ def _recordings(folder: Path) -> dict[str, Names]:
         own = {labels[path]: {path: names[path]} for path in paths if look(path).is_imu or look(path).header in of_imus}
         found |= {name: paths} if name and groups else own
     return found or {labels[path]: {path: names[path]} for path in names if look(path).may_be_imu}
-
-
-def _apart_in_time(groups: dict[Path, str]) -> list[list[Path]]:
-    """Tables of IMUs, those together that were recorded at one time; none where a table does not show its time."""
-    pairs: dict[str, list[Path]] = {}
-    for path, group in groups.items():
-        pairs.setdefault(group.rpartition("/")[0], []).append(path)
-    spans = {path: span_ns(path) for path in groups if path.is_file()} if len(pairs) > 1 else {}
-    known = {path: span for path, span in spans.items() if span}
-    if not known or known.keys() != groups.keys():
-        return []
-    parts, end = list[list[Path]](), 0
-    for pair in sorted(pairs.values(), key=lambda each: min(known[path] for path in each)):
-        if min(known[path][0] for path in pair) > end:
-            parts.append([])
-        parts[-1] += pair
-        end = max(end, *(known[path][1] for path in pair))
-    return parts
 
 
 def _is_narrow(path: Path) -> bool:

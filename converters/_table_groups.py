@@ -10,7 +10,18 @@ from itertools import chain
 from ._table_geodetic import fits_gravity
 from ._table_map import IMU_TOPIC, Entries, column_named
 from ._table_names import ESTIMATED, TIME_WORDS, group_of, name_and_unit, spaced_name, split_name, triples
-from ._table_pose_names import NED, NUMBERS, QUATERNION, QUATERNION_ARRAY, angles_of, axes_of, bodies_of, matrix_of, position_of
+from ._table_pose_names import (
+    NED,
+    NOT_ALIKE,
+    NUMBERS,
+    QUATERNION,
+    QUATERNION_ARRAY,
+    angles_of,
+    axes_of,
+    bodies_of,
+    matrix_of,
+    position_of,
+)
 from ._table_rotations import EITHER_WAY, TURNS, angles_by_motion, matrix_by_motion, order_by_motion
 from ._table_text import Columns, matrix_columns
 from ._table_times import goes_on
@@ -167,10 +178,10 @@ def _why_no_turns(columns: Columns, leaves: dict[str, str], bodies: list[dict[st
     if named:
         return [f"{', '.join(named)} has four columns of no certain order; `quaternion_wxyz` of a map makes poses of them"]
     if nine := matrix_of(leaves):
-        said = "do not turn as the gyro does, or so do their transposes"
+        said = f"{NOT_ALIKE}, nor do their transposes"
         return [f"the matrices {nine[0]}, ... {said}; `rotation_matrix` of a map, row by row, makes poses of them"]
     if three := next(iter(angles_of(leaves)), []):
-        said = "do not turn as the gyro does, as Rz(yaw) Ry(pitch) Rx(roll)"
+        said = f"{NOT_ALIKE}, as Rz(yaw) Ry(pitch) Rx(roll)"
         return [f"{', '.join(three)} {said}; `roll_pitch_yaw` of a map makes poses of them"]
     return []
 

@@ -45,6 +45,21 @@ def load_hdf5(path: Path, columns: Columns) -> None:
         columns.remarks.losses.append(what)
 
 
+def names_of_hdf5(path: Path) -> list[str]:
+    """Names of the arrays of an HDF5 file; one of records or of cells stands for a group."""
+    h5py = required("h5py", "tables", where=path, user="reading it")
+    names: list[str] = []
+
+    def visit(name: str, node: Any) -> None:
+        if isinstance(node, h5py.Dataset) and not name.startswith("#"):
+            own = node.dtype.names or ("1/", "2/") * (node.dtype == h5py.ref_dtype)
+            names.extend([f"{name}/{field}" for field in own] or [name])
+
+    with h5py.File(path, "r") as file:
+        file.visititems(visit)
+    return names
+
+
 def _add_node(columns: Columns, name: str, node: Any, path: Path) -> None:
     """Add the numbers among the attributes of a group or an array, and the array."""
     for key, value in node.attrs.items():

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from itertools import pairwise
 
 from imutool.recording.message_log import Remarks
 
-from ._table_names import TIME_WORDS, distinct_names, split_name, unit_named
+from ._table_names import TIME_WORDS, UNITS, distinct_names, split_name, unit_named
 from ._table_numbers import fields_of, is_number
 
 MOSTLY = 0.8  # share of columns above which a text says nothing of a column
 UNIT_TEXT = re.compile(r"[\[(]?(\W*|[a-zµ°]+([ /*^²\d-]+[a-z\d²-]*)*|-)[\])]?", re.IGNORECASE)
+SENSOR_UNITS = "|".join(UNITS[unit] for unit in ("rad/s", "deg/s", "mdeg/s", "m/s^2", "cm/s^2", "ft/s^2", "mg", "g"))
+OF_COLUMNS = re.compile(  # in a comment: `gx/gy/gz=deg/s`, `ax, ay, az in g`
+    rf"(?P<names>[a-z]\w*(\s*[/,]\s*[a-z]\w*)*)\s*(=|:|\bin\b|[\[(])\s*(?P<unit>{SENSOR_UNITS})(?![\w/^²])"
+)
 
 
 def header_of(lines: list[str], delimiter: str | None, width: int, first: list[str]) -> tuple[list[str], dict[str, str]]:
@@ -46,6 +51,17 @@ def header_of(lines: list[str], delimiter: str | None, width: int, first: list[s
         names, units = (names, units) if _repeats(joint) else (joint, units or below)
     names = distinct_names(names)
     return names, dict(zip(names, units, strict=True)) if units else {}
+
+
+def units_in_comments(lines: Iterable[str], names: list[str]) -> dict[str, list[str]]:
+    """Columns by the unit that a comment states: `gx/gy/gz=deg/s`, `ax, ay, az in g`."""
+    spelled, found = {name.lower(): name for name in names}, dict[str, list[str]]()
+    for line in lines:
+        for match in OF_COLUMNS.finditer(line.lower()):
+            of = [spelled.get(name, "") for name in re.split(r"\s*[/,]\s*", match["names"])]
+            if all(of):
+                found.setdefault(unit_named(match["unit"]), []).extend(of)
+    return found
 
 
 def _lacks_first(names: list[str], first: list[str]) -> bool:

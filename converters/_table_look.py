@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from functools import lru_cache
+from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +26,7 @@ from ._table_units import TIME_NS
 MOST_LOOKED = 64 << 20  # bytes of a table that is no text
 LAST_BYTES = 4096  # of a text, which hold its last row
 LEAST_VECTOR = 3  # numbers in a row of a sensor
+MOST_LARGER = 1.2  # ratio of the sizes of files, or of the times, of IMUs that were recorded together
 SINCE_1970_NS = 10**18  # in 2001; smaller times may count from any start
 logger = logging.getLogger(__name__)
 
@@ -77,7 +79,7 @@ def _looked(path: Path, mtime_ns: int, size: int) -> Seen:  # the key notices a 
 
 
 def span_ns(path: Path) -> tuple[int, int] | None:
-    """First and last time since 1970 of a table of text, by its first rows and its last."""
+    """First and last time of a table of text, by its first rows and its last."""
     status = path.stat()
     return _spanned(path, status.st_mtime_ns, status.st_size)
 
@@ -95,4 +97,37 @@ def _spanned(path: Path, mtime_ns: int, size: int) -> tuple[int, int] | None:
     if "time" not in entries or entries.get("time_unit", "") not in TIME_NS:
         return None
     times_ns = columns.values[entries["time"]].astype(float)[[0, -1]] * TIME_NS[entries["time_unit"]]
-    return (int(times_ns[0]), int(times_ns[1])) if times_ns.min() > SINCE_1970_NS else None
+    return int(times_ns[0]), int(times_ns[1])
+
+
+def recorded_apart(groups: dict[Path, str], tables: list[Path]) -> list[list[Path]]:
+    """Tables of each of several recordings; none where those of several IMUs may be of one.
+
+    Recordings differ in their time since 1970, or in how long they last. Further tables have the name of a pair in front.
+    """
+    pairs: dict[str, list[Path]] = {}
+    for path, group in groups.items():
+        pairs.setdefault(group.rpartition("/")[0], []).append(path)
+    names = {key: _shared([path.name for path in pair]) for key, pair in pairs.items()}
+    others = [path for path in tables if path not in groups]
+    of = {path: [key for key, name in names.items() if name and path.name.startswith(name)] for path in others}
+    spans = {path: span_ns(path) for path in groups if path.is_file()} if len(pairs) > 1 else {}
+    known = {path: span for path, span in spans.items() if span}
+    if not known or known.keys() != groups.keys() or any(len(keys) != 1 for keys in of.values()):
+        return []
+    whole = {key: [*pair, *(path for path, keys in of.items() if keys == [key])] for key, pair in pairs.items()}
+    if min(start for start, _ in known.values()) < SINCE_1970_NS:
+        lasting = [max(known[path][1] - known[path][0] for path in pair) for pair in pairs.values()]
+        return [*whole.values()] if max(lasting) > MOST_LARGER * min(lasting) else []
+    parts, end = list[list[Path]](), 0
+    for key, pair in sorted(pairs.items(), key=lambda each: min(known[path] for path in each[1])):
+        if min(known[path][0] for path in pair) > end:
+            parts.append([])
+        parts[-1] += whole[key]
+        end = max(end, *(known[path][1] for path in pair))
+    return parts
+
+
+def _shared(names: list[str]) -> str:
+    """Beginning that all names share."""
+    return "".join(a for a, _ in takewhile(lambda pair: pair[0] == pair[1], zip(min(names), max(names), strict=False)))

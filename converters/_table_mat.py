@@ -58,6 +58,23 @@ def load_mat(path: Path, columns: Columns) -> None:
         columns.remarks.losses.append(f"its MATLAB objects are left out. {fix}")
 
 
+def names_of_mat(path: Path) -> list[str]:
+    """Names of the arrays of a .mat file; a structure or a cell array stands for two groups.
+
+    Raises:
+        DataError: damaged.
+    """
+    scipy_io = required("scipy.io", "tables", where=path, user="reading it")
+    try:
+        found = scipy_io.whosmat(path)
+    except TypeError:  # scipy reads no header of an object
+        return ["1.array", "2.array"]
+    except Exception as error:  # scipy raises whatever damaged bytes lead to
+        raise DataError(f"cannot be read as a .mat file ({error})", where=path) from error
+    nested = [f"{number}.{name}" for name, _, kind in found if kind in ("struct", "cell") for number in (1, 2)]
+    return [name for name, _, _ in found] + nested
+
+
 def check_size(path: Path, size: int) -> None:
     """Refuse a file that unpacks to more bytes than fit.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 
 XSENS_TIME = r"sample_?time_?fine"  # counts 100 us
 SI_WORDS = r"angular_?velocity|linear_?acceleration|gyro_rad_|accelerometer_m_s2_|gyro_?rotation"  # of ROS, PX4 and CoreMotion
@@ -102,6 +103,7 @@ def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[st
     return dict(zip(named, whole.values(), strict=True))
 
 
+@lru_cache(maxsize=1 << 14)  # of the columns of one file, group by group
 def group_of(column: str) -> str:
     """Group of a column: `mocap` of `mocap/v [m/s]`, and of a structure's `mocap.position[0]`."""
     return re.sub(r"(^|[/.])[^/.]*$", "", re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", column))

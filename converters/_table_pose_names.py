@@ -34,6 +34,7 @@ OWNED = (  # columns of a body's poses: ABBquaternion[0], robot_qw, tool_x
     r"(?P<leaf>(quat|quaternion|orientation|rotation|attitude|pos|position|translation)_?[wxyz0-3])",
     rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+)_(?P<leaf>((q|t|p|ori|rot|trans)_?)?[wxyz0-3])",
 )
+NOT_ALIKE = "do not turn as the gyro does"
 INDICES = [[f"{row + first}{column + first}" for row in range(3) for column in range(3)] for first in (0, 1)]
 NUMBERS = "012345678", "123456789"
 
@@ -46,6 +47,9 @@ def has_poses(columns: Columns) -> bool:
 
 def why_no_poses(columns: Columns, group: str) -> str:
     """Reason why a table that is named as poses gives none, and what to do."""
+    noted = (note for note in columns.remarks.notes if NOT_ALIKE in note and f"{group}/" in note)
+    if group and (note := next(noted, "")):
+        return note
     leaves = {split_name(name.removeprefix(f"{group}/"))[0]: name for name in columns.values if name.startswith(f"{group}/")}
     if position_of(leaves) and not _has_turns(leaves):
         return "it has positions without orientations, and imutool uses no positions alone; its columns are topics of the log"

@@ -8,8 +8,11 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
+
+from imutool.recording.message_log import Remarks
 
 from ._table_groups import is_time, is_true, measured
 from ._table_headerless import in_an_array
@@ -30,13 +33,18 @@ def groups_apart(columns: Columns) -> dict[str, Columns]:
     What is in no recording's group is in every one.
     """
     for parent in [] if known_layout(columns) else _parents(columns):
-        groups = _groups_in(columns, parent)
-        imus = {group: part for group, part in groups.items() if not is_true(f"{group}/") and _has_imu(part)}
+        names = _names_by_group(columns, parent)
+        shared = names.pop("", {})
+        groups = {group: renamed(columns, inside) for group, inside in names.items() if not is_true(f"{group}/")}
+        imus = {group: part for group, part in groups.items() if _has_imu(part)}
         if len(imus) > 1 and _are_recordings(parent, imus):
+            shared |= {name: name for group in names.keys() - imus.keys() for name in names[group]}
+            labels = {own: columns.sources[own] for group in imus if (own := f"{parent}{group}") in columns.sources}
             found: dict[str, Columns] = {}
             for group in imus:
-                name = part_name(leaf_of(parent[:-1]), group)
-                for inner, each in groups_apart(_with_shared(columns, parent, group, imus)).items():
+                name, part = part_name(leaf_of(parent[:-1]), group), renamed(columns, shared | names[group])
+                part.remarks = _without(columns.remarks, [label for own, label in labels.items() if own != f"{parent}{group}"])
+                for inner, each in groups_apart(part).items():
                     found[distinct("_".join(filter(None, (name, inner))), found)] = each
             return found
     return {"": columns}
@@ -50,8 +58,9 @@ def part_name(column: str, text: str) -> str:
 
 def distinct(name: str, others: Mapping[str, object]) -> str:
     """The name, or `name 2` for one that others have."""
-    again = sum(re.fullmatch(rf"{re.escape(name)}( \d+)?", other) is not None for other in others)
-    return f"{name} {again + 1}" if again else name
+    if name not in others:
+        return name
+    return next(again for number in count(2) if (again := f"{name} {number}") not in others)
 
 
 def _parents(columns: Columns) -> list[str]:
@@ -61,50 +70,29 @@ def _parents(columns: Columns) -> list[str]:
     return ["", *sorted(ends, key=lambda end: (len(re.findall(r"[/.]", end)), end))]
 
 
-def _groups_in(columns: Columns, parent: str) -> dict[str, Columns]:
-    """Columns of each group directly below another, without its name."""
-    names = [group[len(parent) :] for name in columns.values if (group := group_of(name)).startswith(parent)]
-    groups = dict.fromkeys(re.split(r"[/.]", name)[0] for name in names if name)
-    return {group: _below(columns, f"{parent}{group}") for group in groups if group}
-
-
-def _is_below(name: str, group: str) -> bool:
-    return name.startswith(group) and name[len(group) : len(group) + 1] in ("/", ".")
-
-
-def _below(columns: Columns, group: str) -> Columns:
-    """Columns of a group, without its name."""
-    inside = {name: name[len(group) + 1 :] for name in _every_name(columns) if _is_below(name, group)}
-    return renamed(columns, inside)
-
-
-def _every_name(columns: Columns) -> list[str]:
-    return [*columns.values, *columns.labels, *columns.numbers, *columns.sources]
+def _names_by_group(columns: Columns, parent: str) -> dict[str, dict[str, str]]:
+    """Names without those of their groups, by the groups directly below another; under no name those in none of them."""
+    found: dict[str, dict[str, str]] = {}
+    for name in [*columns.values, *columns.labels, *columns.numbers, *columns.sources]:
+        around = name if name in columns.sources else group_of(name)
+        group = re.split(r"[/.]", around[len(parent) :], maxsplit=1)[0] if around.startswith(parent) else ""
+        found.setdefault(group, {})[name] = name[len(parent) + len(group) + 1 :] if group else name
+    return found
 
 
 def renamed(columns: Columns, names: Mapping[str, str]) -> Columns:
     """Some columns under other names, without remarks."""
     part = Columns(has_structures=columns.has_structures, is_mocap=columns.is_mocap)
     for field in ("values", "units", "numbers", "texts", "labels", "sources"):
-        setattr(part, field, {new: each[old] for old, new in names.items() if old in (each := getattr(columns, field))})
+        setattr(part, field, {new: each[old] for old, new in names.items() if new and old in (each := getattr(columns, field))})
     return part
 
 
-def _with_shared(columns: Columns, parent: str, group: str, groups: Mapping[str, Columns]) -> Columns:
-    """Columns of a group without its name, and those that are in none of the groups."""
-    own = f"{parent}{group}"
-    others = [f"{parent}{other}" for other in groups if other != group]
-    every = [name for name in _every_name(columns) if not any(name == other or _is_below(name, other) for other in others)]
-    kept = {name: name for name in every if not _is_below(name, own) and name != own}
-    part = renamed(columns, kept | {name: name[len(own) + 1 :] for name in every if _is_below(name, own)})
-    theirs = tuple(f"{label}: " for source, label in columns.sources.items() if source in others)
-    remarks = columns.remarks
-    part.remarks = replace(
-        remarks,
-        notes=[note for note in remarks.notes if not note.startswith(theirs)],
-        losses=[loss for loss in remarks.losses if not loss.startswith(theirs)],
-    )
-    return part
+def _without(remarks: Remarks, labels: list[str]) -> Remarks:
+    """Remarks but for those on other tables, which begin with their labels."""
+    theirs = tuple(f"{label}: " for label in labels)
+    notes, losses = ([each for each in said if not each.startswith(theirs)] for said in (remarks.notes, remarks.losses))
+    return replace(remarks, notes=notes, losses=losses)
 
 
 def _has_imu(columns: Columns) -> bool:

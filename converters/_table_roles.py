@@ -8,12 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ._table_groups import TRUE_GROUPS
-from ._table_look import look
+from ._table_look import MOST_LARGER, look
 from ._table_map import IMU_GROUP, POSES_GROUP, TRUTH_GROUP
 from ._table_sensors import SENSORS, SPACED, WORD, pairs_among, plain_among, sensors_among
 
 Names = Mapping[Path, str]  # of tables, without their endings
-MOST_LARGER = 1.2  # ratio of the sizes of files of IMUs that were recorded together
 IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of UZH-FPV's imu.txt; else its columns show it
 IMUS = r"(imu|inertial)[ _-]?\w{1,20}"  # of several beside one file of poses: imu_1, imu_left
 POSES = rf"(.*[ _-])?({TRUE_GROUPS}|ground[ _-]truth)([ _-].*)?"  # groundtruth.txt, stamped_groundtruth_imu.txt

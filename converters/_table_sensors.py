@@ -18,11 +18,11 @@ from ._table_headerless import name_headerless
 from ._table_names import UNITS, is_of_recordings, split_name
 from ._table_numbers import is_number
 from ._table_text import COMMENTS, Columns, read_csv
-from ._table_times import rises
+from ._table_times import in_batches, rises
 
 SENSORS = {  # words in the names of files and of sensors
-    "gyro": r"gyr|gyros?|gyroscopes?|gyroskop|giroscopio|giroscopo",
-    "accel": r"acc[el]?|accels?|accelerometers?|accelerations?|acelerometro|accelerometre|beschleunigung(ssensor)?",
+    "gyro": r"gyrm?|gyros?|gyroscopes?|gyroskop|giroscopio|giroscopo",
+    "accel": r"acc[elm]?|accels?|accelerometers?|accelerations?|acelerometro|accelerometre|beschleunigung(ssensor)?",
 }
 OTHERS = r"bias|biases|calib|calibration|linear|linea[lr]|user|gravity|noise|allan|stride|labels?"
 UNCORRECTED = r"uncal|uncalib|uncalibrated|raw|ref|reference"  # taken where nothing else is there: not calibrated, or ideal
@@ -206,7 +206,8 @@ def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
 
 def _ascends(values: np.ndarray) -> bool:
     """Whether a column is a time, even one that was set back once, and not a component of a vector."""
-    return rises(values) or (len(values) > 1 and float(np.mean(np.diff(values.astype(float)) > 0)) > ALWAYS)
+    is_set_back = len(values) > 1 and float(np.mean(np.diff(values.astype(float)) > 0)) > ALWAYS
+    return rises(values) or is_set_back or in_batches(values)
 
 
 def _turns(table: Columns, names: list[str]) -> bool:

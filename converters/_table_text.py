@@ -19,7 +19,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
 from ._table_dates import calendar_times, damaged_times, join_dates
-from ._table_header import header_of, note_unused_header
+from ._table_header import header_of, note_unused_header, units_in_comments
 from ._table_names import leaf_of, tells_apart
 from ._table_numbers import (
     COMMA_NUMBER,
@@ -176,6 +176,9 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
     firsts = [row[0].strip().strip('"') for row in fields_of(lines[first : first + FIRSTS], delimiter) if len(row) == width]
     names, units = header_of(lines[:first], delimiter, width, firsts)
     note_unused_header(lines[:first], delimiter, names, columns.remarks)
+    for unit, of in units_in_comments((line for line in lines[:first] if line.startswith(COMMENTS)), names).items():
+        units |= dict.fromkeys(of, unit)
+        columns.remarks.notes.append(f"{', '.join(of)} in {unit}, by a comment above the table")
     commas: list[str] = []
     empty: list[str] = []
     if (joined := join_dates(names, fields)) is not None:

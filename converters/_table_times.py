@@ -97,9 +97,10 @@ def rises(values: np.ndarray) -> bool:
 
 
 def goes_on(values: np.ndarray) -> bool:
-    """Whether a column named as a time is one: rounded, it may stand still, but not go back."""
+    """Whether a column named as a time is one: it may stand still, but not go back."""
     steps = np.diff(values.astype(float))
-    return rises(values) or (len(steps) > 0 and float(np.mean(steps > 0)) > 0.5 and float(np.mean(steps >= 0)) > 0.99)
+    is_rounded = len(steps) > 0 and float(np.mean(steps > 0)) > 0.5 and float(np.mean(steps >= 0)) > 0.99
+    return rises(values) or is_rounded or in_batches(values)
 
 
 def in_batches(values: np.ndarray) -> bool:

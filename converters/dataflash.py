@@ -1,4 +1,4 @@
-"""ArduPilot DataFlash (.bin, .log): IMUs in FLU with their temperatures, EKF poses as an estimate, every message.
+"""ArduPilot DataFlash (.bin, .log): IMUs in FLU, EKF poses as an estimate, every message.
 
 The log describes its own messages (FMT), in binary or as text with a message a line; no library is needed. ArduPilot measures
 in FRD and its world is NED: the IMU and pose topics are written in FLU and ENU, the other topics keep its own frames. Stamps
@@ -24,8 +24,8 @@ from imutool.recording.sample_order import in_order
 from . import Sequence
 from ._archive import refusing
 from ._dataflash_messages import FMT, FMT_SIZE, HEAD, TEXT_START, Messages, read_messages, text_of
+from ._px4_topics import FLU_FROM_FRD, Q_ENU_FROM_NED_WXYZ, Q_FRD_FROM_FLU_WXYZ
 from ._source import find_files
-from .ulog import FLU_FROM_FRD, Q_ENU_FROM_NED_WXYZ, Q_FRD_FROM_FLU_WXYZ
 
 GENERAL = True
 TEMPERATURES = "T", "Temp"  # of the sensor, in degrees Celsius; of older logs the second

@@ -21,7 +21,7 @@ from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.model_choice import bound_to, check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
-from imutool.bias_start.stretches import measured_imu, read_stretches
+from imutool.bias_start.stretches import measured_imu, read_stretches, without_vectors
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids, parse_aids
@@ -39,6 +39,7 @@ from imutool.inertial.strapdown import (
 from imutool.log_info.aid_search import find_aids
 from imutool.log_info.convention_report import contradictions, warn_of_recordings
 from imutool.mcap_io.log import Log
+from imutool.processes.system import release_memory
 from imutool.recording import Imu, Poses, Recording, nanoseconds
 
 logger = logging.getLogger(__name__)
@@ -86,7 +87,8 @@ def evaluate(
         _refuse_twins(models)
     asked = None if aid is None else parse_aids(aid)
     results = list[dict[str, Any]]()
-    stretches = read_stretches(log, imu=imu, truth=truth)
+    stretches = [without_vectors(stretch) for stretch in read_stretches(log, imu=imu, truth=truth)]
+    release_memory()
     in_log = [None] * len(stretches) if models else _debiased(log, stretches, truth)
     for stretch, debiased in zip(stretches, in_log, strict=True):
         recording = replace(stretch, imu=measured_imu(stretch.imu, f"{log} {stretch.imu_topic}"))
@@ -99,20 +101,20 @@ def evaluate(
     return results
 
 
-def _debiased(log: Path, stretches: Sequence[Recording], truth: str | None) -> Sequence[Recording | None]:
-    """The same stretches with the samples that the log has debiased."""
+def _debiased(log: Path, stretches: Sequence[Recording], truth: str | None) -> Sequence[Imu | None]:
+    """The samples of the same stretches that the log has debiased."""
     from imutool.debiasing import SUFFIX
 
     topic = f"{stretches[0].imu_topic}{SUFFIX}"
     with Log(log) as opened:
         known = topic in opened.topics
-    found = read_stretches(log, imu=topic, truth=truth) if known else []
+    found = [stretch.imu for stretch in read_stretches(log, imu=topic, truth=truth)] if known else []
     return found if len(found) == len(stretches) else [None] * len(stretches)
 
 
 def _evaluated(
     recording: Recording,
-    debiased: Recording | None,
+    debiased: Imu | None,
     log: Path,
     models: Sequence[str | Path],
     init: str,
@@ -132,7 +134,7 @@ def _evaluated(
     recording = replace(recording, truths={next(iter(recording.truths)): with_velocity(truth)})
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     recorded = [(RAW, recording.imu, None, None)]
-    recorded += [] if debiased is None else [(str(about.get("model") or "debiased"), debiased.imu, None, None)]
+    recorded += [] if debiased is None else [(str(about.get("model") or "debiased"), debiased, None, None)]
     found = started(recording, models, init, log, smooth=smooth, refused=refused)
     for name, imu, model, start in [*recorded, *((name, recording.imu, model, start) for name, model, start in found)]:
         rows, true, valid = stretch_with_truth(imu.t_ns, recording.truth, recording.name)
@@ -140,53 +142,53 @@ def _evaluated(
         debiasing, std = _corrected(imu, model, start, with_std=aids is not None)
         corrected = debiasing.imu
         del debiasing  # no array as long as the log stays when it is no longer needed
-        drifted = _drifts(corrected, (rows, true, valid), recording, model, start)
+        release_memory()
         estimates = {PURE: dead_reckon(corrected.rows(rows), StartPose.of(true))}
         if name == RAW and (gaps := gaps_crossed(estimates[PURE], GAP_S, int(recording.imu.t_ns[0]))):
             logger.warning("%s: %s", recording.name, gaps)
         if aids is not None:
             estimates[AIDED] = aided_path(corrected.rows(rows), StartPose.of(true), residual_prior(start, std), aids)
+        how = {"init": init if start else None, "init_how": start.how if start else None, "smooth": smooth}
+        scores = list[dict[str, Any]]()
         for kind, estimate in estimates.items():
-            results.append(
-                {
-                    "log": recording.name,
-                    "model": name,
-                    "estimate": kind,
-                    "aids": aids.signals if aids and kind == AIDED else {},
-                    "init": init if start else None,
-                    "init_how": start.how if start else None,
-                    "smooth": smooth,
-                    "fit": fit and to_builtins(fit),
-                    **metrics.evaluate(estimate, true, valid),
-                    **drifted,
-                    "gyro_bias": start.rest[:3].tolist() if start else [0.0, 0.0, 0.0],
-                    "accel_bias": start.rest[3:].tolist() if start else [0.0, 0.0, 0.0],
-                }
-            )
+            of = {
+                "log": recording.name,
+                "model": name,
+                "estimate": kind,
+                "aids": aids.signals if aids and kind == AIDED else {},
+            }
+            scores.append(of | how | {"fit": fit and to_builtins(fit)} | metrics.evaluate(estimate, true, valid))
             if trajectories is not None:
                 if (name, kind) == (RAW, PURE):
                     metrics.write_trajectory(true.rows(valid), trajectories, recording.name, "truth", overwrite)
                 label = name if kind == PURE else f"{name}_{kind}"
                 metrics.write_trajectory(estimate.rows(valid), trajectories, recording.name, label, overwrite)
-        del corrected, estimates, estimate
+        del estimates, estimate
+        corrected = trapezoidal(corrected)  # now means of each sample and the next
+        drifted, delay = _drifts(corrected, (rows, true, valid), recording, model, start)
+        del true, valid
+        drifted |= _without_delay(delay, corrected, recording, drifted[DRIFTS[0]])
+        bias = np.zeros(6) if start is None else start.rest
+        results += [score | drifted | {"gyro_bias": bias[:3].tolist(), "accel_bias": bias[3:].tolist()} for score in scores]
+        del corrected
     return results
 
 
 def _drifts(
-    corrected: Imu,
+    means: Imu,
     truth: tuple[slice, Poses, Mask],
     recording: Recording,
     model: BiasModel | None,
     start: InitialBias | None,
-) -> Figures:
-    """Drift of windows that start from the truth, what the bias covariance expects, and a delay of the poses."""
-    means = trapezoidal(corrected)
+) -> tuple[Figures, tuple[float, float] | None]:
+    """Drift of windows that start from the truth, what the bias covariance expects, and a delay of the poses.
+
+    `means` are those of each sample and the next (`kinematics.trapezoidal`).
+    """
     rows, true, valid = truth
     path = dead_reckon(means.rows(rows), StartPose.of(true))
     drifted = _drift(path, true, valid, model, start, recording.imu)
-    delay = metrics.pose_delay(path, true, drift_windows(path, valid, DELAY_WINDOW_S)) if model else None
-    del path
-    return drifted | _without_delay(delay, means, recording, drifted[DRIFTS[0]])
+    return drifted, metrics.pose_delay(path, true, drift_windows(path, valid, DELAY_WINDOW_S)) if model else None
 
 
 def _drift(path: Poses, true: Poses, valid: Mask, model: BiasModel | None, start: InitialBias | None, imu: Imu) -> Figures:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from imutool.array_types import Float64
+from imutool.bias_start.stretches import without_vectors
 from imutool.config import build
 from imutool.errors import DataError
 from imutool.file_location import Location
@@ -24,12 +25,11 @@ from imutool.noise import allan
 from imutool.noise import datasheet as noise
 from imutool.noise.allan import Curve, Slopes
 from imutool.noise.datasheet import UNITS, Noise
+from imutool.processes.system import release_memory
 from imutool.recording import Imu, Recording
 from imutool.units import SENSORS, Sensor
 
 KINDS = ("density", "walk", "instability")  # of each sensor, as `Noise` has them
-LEAST_FREEDOM = 10.0  # degrees of freedom that an averaging time needs to bound a density from above
-BOUND_RISK = 0.002  # probability that one averaging time puts the bound too low
 SHORT = 2.5  # samples: over longer windows vibration averages out, and no longer bounds the residual from below
 DEPENDENT_TRUTH = 0.25  # of a sample's white noise: an independent truth differs by more
 EXPLAINED = 3.0  # times a sample's white noise: a larger residual comes from the truth or the calibration
@@ -88,7 +88,8 @@ def identify(
     path, recording = log.path, longest_recording(read_recordings(log, imu=imu, truth=truth))
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
-    recording, remarks = in_si_units(recording)
+    recording, remarks = in_si_units(without_vectors(recording))
+    release_memory()
     rest = _at_rest(recording.imu, remarks)
     motion = None
     if recording.truths:
@@ -98,10 +99,10 @@ def identify(
             remarks.append(f"in motion: {error.what}")
     else:
         remarks.append("in motion: the log has no true poses")
-    root_s = np.sqrt(recording.imu.period_s)
-    samples = {sensor: white_noise(getattr(recording.imu, sensor)) * root_s for sensor in SENSORS}
-    at_most = {sensor: _bound(rest.curves[sensor]) if rest is not None else UNKNOWN for sensor in SENSORS}
-    combined = _combine(rest, motion, samples, at_most, recording.imu.period_s, remarks)
+    period_s = recording.imu.period_s
+    samples = {sensor: white_noise(getattr(recording.imu, sensor)) * np.sqrt(period_s) for sensor in SENSORS}
+    at_most = {sensor: allan.density_bound(rest.curves[sensor]) if rest is not None else UNKNOWN for sensor in SENSORS}
+    combined = _combine(rest, motion, samples, at_most, period_s, remarks)
     if rest is None and motion is None:
         raise DataError(
             f"the log shows no noise: {'; '.join(remarks)}",
@@ -113,8 +114,7 @@ def identify(
 
 
 def _at_rest(imu: Imu, remarks: list[str]) -> CurveSource | None:
-    stretches = rest_stretches(imu)
-    if not stretches:
+    if not (stretches := rest_stretches(imu)):
         remarks.append("at rest: the log never rests")
         return None
     parts = [imu.rows(slice(*bounds)) for bounds in stretches]
@@ -166,14 +166,18 @@ def _by_fit(recording: Recording) -> tuple[Imu, str]:
     from imutool.training.training_windows import Pool
 
     pool = Pool.of([recording])
+    release_memory()
     model = static.Network(rate_hz=pool.rate_hz).double()
     rest = torch.zeros(1, 6, dtype=torch.float64)
-    corrected = []
-    for column, sensor in enumerate(SENSORS):
-        u = getattr(recording.imu, sensor)
+    matrices = []
+    for k, sensor in enumerate(SENSORS):
         solution = closed_form.solve(model, sensor, pool, rest, WINDOWS_S[sensor], matrix=True, part="all")
-        rest[:, 3 * column : 3 * column + 3] = solution.rest
-        corrected.append(u - u @ solution.W.numpy().T - solution.rest.numpy())
+        rest[:, 3 * k : 3 * k + 3] = solution.rest
+        matrices.append(solution.W.numpy())
+    del pool
+    release_memory()
+    columns = zip((recording.imu.gyro, recording.imu.accel), matrices, rest.numpy().reshape(2, 3), strict=True)
+    corrected = [u - u @ W.T - constant for u, W, constant in columns]
     return Imu(recording.imu.t_ns, *corrected), "corrected by a matrix and a constant fitted to it"
 
 
@@ -233,19 +237,6 @@ def _well_determined(
         )
     bounds = [np.inf if value is None else value for value in at_most]
     return [bool(r <= EXPLAINED and d <= bound) for r, d, bound in zip(ratio, density, bounds, strict=True)]
-
-
-def _bound(curve: Curve) -> list[float | None]:
-    """Upper bound of the white density by axis: least of deviation * sqrt(tau) with its confidence."""
-    from scipy.special import gammaincinv
-
-    enough = curve.freedom >= LEAST_FREEDOM
-    if not enough.any():
-        return UNKNOWN
-    freedom = curve.freedom[enough]
-    stretch = np.sqrt(freedom / (2.0 * gammaincinv(freedom / 2.0, BOUND_RISK)))  # the quantile of chi²
-    bounds = curve.deviation[enough] * (np.sqrt(curve.tau_s[enough]) * stretch)[:, None]
-    return [float(value) for value in bounds.min(axis=0)]
 
 
 def _duration(seconds: float) -> str:

@@ -104,7 +104,8 @@ def expected_drift(
     count, nor does the noise of the samples: vibration is no white noise, and the noise at rest is much less than the bias.
     """
     estimator, good = BiasEstimator(model, start), measured(imu.gyro, imu.accel)
-    t_ns, accel, samples = imu.t_ns[good], imu.accel[good], model_samples(model, imu)
+    imu = imu if good.all() else imu.rows(good)
+    t_ns, accel, samples = imu.t_ns, imu.accel, model_samples(model, imu)
     out, done = np.zeros((len(windows), 6, 6)), 0
     for k, (first_ns, last_ns) in enumerate(path.t_ns[windows]):
         a, b = int(np.searchsorted(t_ns, first_ns)), int(np.searchsorted(t_ns, last_ns, side="right")) - 1

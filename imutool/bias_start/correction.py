@@ -47,7 +47,7 @@ def apply(model: BiasModel, start: InitialBias, imu: Imu) -> DebiasedImu:
     for rows in _blocks(len(bias)):
         bias[rows] = stream(*(column[rows] for column in samples))
     bias = _with_drift(model, imu, _to_all(good, bias))
-    return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
+    return _debiased(imu, bias)
 
 
 def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[DebiasedImu, Float64[np.ndarray, "n 6"]]:
@@ -65,7 +65,14 @@ def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debi
             covariance += model.log_drift.covariance(t_ns[rows])
         std[rows] = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
     bias, std = _with_drift(model, imu, _to_all(good, bias)), _to_all(good, std)
-    return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias), std
+    return _debiased(imu, bias), std
+
+
+def _debiased(imu: Imu, bias: Float64[np.ndarray, "n 6"]) -> DebiasedImu:
+    gyro, accel = imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]
+    for column in (gyro, accel):  # so that the samples need no copy
+        column.flags.writeable = False
+    return DebiasedImu(Imu(imu.t_ns, gyro, accel), bias)
 
 
 def _blocks(count: int) -> Iterator[slice]:

@@ -32,6 +32,7 @@ MOST = np.array([1e4] * 3 + [1e6] * 3)  # rad/s and m/s²: no gyro or accelerome
 LEAST_FORCE_M_S2 = 1e-9  # on some axis: even in free fall a sensor's noise exceeds it
 GRAVITY_RANGE = (0.4, 2.5)  # of the median specific force to gravity; a sensor in g has 0.1, a racing drone up to 2
 MOST_STRETCHES = 1000  # that a report lists
+AT_ONCE = 1 << 13  # samples
 NOT_FINITE, OUT_OF_RANGE, ZERO_FORCE = "not_finite", "out_of_range", "zero_force"
 
 logger = logging.getLogger(__name__)
@@ -74,7 +75,10 @@ def unmeasured(gyro: Rows3, accel: Rows3) -> Mapping[str, Bool[np.ndarray, " n"]
 
 def measured(gyro: Rows3, accel: Rows3) -> Bool[np.ndarray, " n"]:
     """Samples that are a measurement."""
-    good: Bool[np.ndarray, " n"] = ~np.logical_or.reduce(list(unmeasured(gyro, accel).values()))
+    good = np.empty(len(gyro), bool)
+    for first in range(0, len(gyro), AT_ONCE):
+        rows = slice(first, first + AT_ONCE)
+        good[rows] = ~np.logical_or.reduce(list(unmeasured(gyro[rows], accel[rows]).values()))
     return good
 
 
@@ -89,6 +93,8 @@ def measured_imu(imu: Imu, where: str, *, free_fall: bool = False) -> Imu:
     """
     if len(imu) < 2:
         raise DataError(f"the IMU has {len(imu)} samples", where=where, expected="at least 2")
+    if measured(imu.gyro, imu.accel).all():
+        return imu
     reasons = {why: mask for why, mask in unmeasured(imu.gyro, imu.accel).items() if not (free_fall and why == ZERO_FORCE)}
     left_out = {reason: int(mask.sum()) for reason, mask in reasons.items() if mask.any()}
     if not left_out:
@@ -152,6 +158,12 @@ def read_stretches(path: Location, *, imu: str | None = None, truth: str | None 
         logger.warning("%s: %d stretches of its clock hold no poses, and are left out", path, len(parts) - len(found))
     named = [replace(part, name=f"{part.name}_{n}") for n, part in enumerate(found, 1)]
     return named if len(parts) > 1 and named else parts[:1]
+
+
+def without_vectors(recording: Recording) -> Recording:
+    """The recording with the scalars alone that a temperature can be."""
+    numbers = {topic: scalars for topic, scalars in recording.scalars.items() if scalars.values.shape[1] == 1}
+    return replace(recording, scalars=numbers)
 
 
 class StretchClock:

@@ -179,11 +179,14 @@ def _told_apart(jobs: list[Job], source: Path) -> list[Job]:
 
 
 def _with_folders(job: Job, source: Path) -> Job:
-    inside, folder = job.sequence.inside, source.resolve()
+    """The job with its folders in front; a file that is named as its folder gets its own name back."""
+    name, inside, folder = job.sequence.name, job.sequence.inside, source.resolve()
     path = job.sequence.path.parent.resolve() / job.sequence.path.name  # which may be a link out of the folder
     below = path.relative_to(folder).parts if path.is_relative_to(folder) else ()
-    folders = [*below[:-1], *([Path(below[-1]).stem] if below and inside else []), *PurePosixPath(inside).parts[:-1]]
-    return replace(job, sequence=replace(job.sequence, name="_".join([*folders, job.sequence.name])))
+    stem = path.stem if below and inside and not name.startswith(path.stem) else ""
+    folders = [*below[:-1], *filter(None, [stem]), *PurePosixPath(inside).parts[:-1]]
+    name = path.stem if not inside and below[-2:-1] == (name,) and path.is_file() else name
+    return replace(job, sequence=replace(job.sequence, name="_".join([*folders, name])))
 
 
 def _converters(format: str) -> list[tuple[str, ModuleType]]:

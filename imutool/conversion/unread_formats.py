@@ -10,6 +10,7 @@ from imutool.errors import DataError
 from imutool.file_location import compression, first_bytes
 
 ENOUGH = 1024  # bytes of a file's start
+MOST_FILES = 1000  # of a folder, which are looked at
 FORMATS = {  # what a file that begins like this is, and what to do
     rb"H Product:Blackbox": (
         "it is a blackbox log of Betaflight or INAV",
@@ -55,6 +56,10 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "it is a pickle of Python, which can run any program when it is read",
         "Load it where you trust its source, save the arrays with numpy.savez, and convert that",
     ),
+    rb"version https://git-lfs\.github\.com/spec/": (
+        "it is a pointer of Git LFS in place of the file",
+        "Get the files with git lfs pull, and convert again",
+    ),
     rb"PK\x03\x04|.{257}ustar": (
         "it is an archive whose name does not end in .zip, .tar, .tar.gz or .tgz",
         "Give it the ending of its kind, or unpack it and convert the folder that is in it",
@@ -90,15 +95,27 @@ def describe_unread(start: bytes) -> tuple[str, str]:
         return "it is empty", "See whether the recorder was stopped properly"
     if program := compression(start):
         return f"it is compressed with {program}", f"Unpack it first, for instance with {program} -d"
-    found = (said for pattern, said in FORMATS.items() if re.match(pattern, start, re.DOTALL))
-    return next(found, WITHOUT_NUMBERS if _is_text(start) else ("", ""))
+    return _known(start) or (WITHOUT_NUMBERS if _is_text(start) else ("", ""))
+
+
+def _known(start: bytes) -> tuple[str, str] | None:
+    return next((said for pattern, said in FORMATS.items() if re.match(pattern, start, re.DOTALL)), None)
 
 
 def describe_folder(folder: Path) -> tuple[str, str]:
     """What a folder is in which no recording was found, and what to do."""
-    names = {name.lower() for _, _, files in os.walk(folder) for name in files}
+    paths = [Path(inside, name) for inside, _, files in os.walk(folder) for name in sorted(files)]
+    names = {path.name.lower() for path in paths}
     if names & ST_DATALOG and any(name.endswith(".dat") for name in names):
         return "it is an acquisition of ST's High Speed Datalog", "Export it as CSV with ST's stdatalog, and convert that"
+    said: dict[tuple[str, str], list[str]] = {}
+    for path in paths[:MOST_FILES]:
+        if path.is_file() and (found := _known(first_bytes(path, ENOUGH))):
+            said.setdefault(found, []).append(path.name)
+    if said:
+        (what, fix), alike = max(said.items(), key=lambda each: len(each[1]))
+        others = f" and {len(alike) - 1} other{'s' * (len(alike) > 2)}" if len(alike) > 1 else ""
+        return f"of {alike[0]}{others}, {what}", fix
     if names:
         return (
             "",

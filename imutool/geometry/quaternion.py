@@ -13,7 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Int64
 
 Quaternions = Float64[np.ndarray, "n 4"]
 Vectors = Float64[np.ndarray, "n 3"]
@@ -147,6 +147,18 @@ def slerp(a: Quaternions, b: Quaternions, share: Column) -> Quaternions:
     whole = np.sinc(angle)
     to_a, to_b = ((part * np.sinc(part * angle) / whole)[:, None] for part in (1.0 - share, share))
     return np.asarray(to_a * a + to_b * b)
+
+
+def between_rows(q: Float64[np.ndarray, "m 4"], after: Int64[np.ndarray, " n"], share: Column) -> Quaternions:
+    """Unit quaternions between rows, by slerp in blocks.
+
+    From the row before `after` (share 0) to the row `after` (share 1).
+    """
+    out = np.empty((len(after), 4))
+    for first in range(0, len(after), ROWS_AT_ONCE):
+        rows = slice(first, first + ROWS_AT_ONCE)
+        out[rows] = unit(slerp(q[after[rows] - 1], q[after[rows]], share[rows]))
+    return out
 
 
 @_in_blocks

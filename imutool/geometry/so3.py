@@ -22,12 +22,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from imutool.array_types import Float, Int
+from imutool.array_types import Float, Float64, Int
 
 Vectors = Float[Tensor, "*batch 3"]
+ROWS_AT_ONCE = 1 << 13  # whose steps stay in a core's cache
 Rotations = Float[Tensor, "*batch 3 3"]
 Quaternions = Float[Tensor, "*batch 4"]
 Angles2 = Float[Tensor, "*batch"]
@@ -134,6 +136,18 @@ def matrix_from_quaternion_wxyz(q_wxyz: Quaternions) -> Rotations:
     w, v = q[..., 0, None, None], q[..., 1:]
     skew = hat(v)
     return torch.eye(3, dtype=q.dtype, device=q.device) + 2.0 * w * skew + 2.0 * (skew @ skew)
+
+
+def matrices_from_rows_wxyz(q_wxyz: Float64[np.ndarray, "n 4"]) -> Float[Tensor, "n 3 3"]:
+    """Rotations of many quaternions, in blocks.
+
+    The steps of all at once take four times the memory of the result.
+    """
+    R = torch.empty(len(q_wxyz), 3, 3, dtype=torch.float64)
+    for first in range(0, len(q_wxyz), ROWS_AT_ONCE):
+        rows = slice(first, first + ROWS_AT_ONCE)
+        R[rows] = matrix_from_quaternion_wxyz(torch.from_numpy(q_wxyz[rows].copy()))
+    return R
 
 
 def _quadratic(xi: Vectors, linear: Angles2, square: Angles2) -> Rotations:

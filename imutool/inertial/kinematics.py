@@ -189,4 +189,6 @@ def trapezoidal(imu: Imu) -> Imu:
     The Euler rule, by which the paths are integrated, lags by half a sample, as if the poses were early.
     """
     gyro, accel = (np.concatenate([0.5 * (u[1:] + u[:-1]), u[-1:]]) for u in (imu.gyro, imu.accel))
+    for column in (gyro, accel):  # so that the samples need no copy
+        column.flags.writeable = False
     return Imu(imu.t_ns, gyro, accel)

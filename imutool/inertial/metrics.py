@@ -20,7 +20,7 @@ roe_deg, rpe_m      mean rotation angle and mean length of the difference of mot
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +35,14 @@ from imutool.recording.columns import median
 
 DISTANCES_M = (5.0, 10.0, 15.0, 20.0)
 PAIR_TOLERANCE = 0.1  # relative tolerance of a pair's distance: evo's default
-AT_ONCE = 1 << 13  # pairs, so that their arrays stay in the cache
+AT_ONCE = 1 << 13  # poses or pairs, so that their arrays stay in the cache
 # least singular value (m²): below it positions lie on a line for evo, and rotation about the line is free
 FLAT = np.finfo(np.float64).eps
 FEWEST_WINDOWS, MOST_MISSED = 10, 4.0  # that show a delay of the poses; of the median error of windows, that of one that counts
 
 Mask = Bool[np.ndarray, " n"]
 Points = Float64[np.ndarray, "n 3"]
+Quaternions = Float64[np.ndarray, "_ 4"]
 
 
 def evaluate(estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[float] = DISTANCES_M) -> dict[str, Any]:
@@ -74,7 +75,6 @@ def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | No
         NumericsError: a figure is not finite.
     """
     estimate, truth = _scored(estimate, truth, valid)
-    q_est, q_true = _unit(estimate), _unit(truth)
     p_est, p_true, known = estimate.p_wb, truth.p_wb, truth.has_positions
     with np.errstate(over="ignore", invalid="ignore"):  # `_check_finite` checks the figures
         motion = align(p_est, p_true)
@@ -82,12 +82,12 @@ def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | No
         if motion is not None:
             R, shift = motion
             aligned = (
-                _rms(np.degrees(quaternion.angle_between(quaternion.multiply(quaternion.of_matrix(R), q_est), q_true))),
-                _rms(p_est @ R.T + shift - p_true),
+                _rms(_turned_deg(estimate, truth, quaternion.of_matrix(R))),
+                _rms(_apart(p_est @ R.T, shift, p_true)),
             )
         v_est, v_true = estimate.v_w, truth.v_w
         figures = {
-            "aoe_deg": _rms(np.degrees(quaternion.angle_between(q_est, q_true))),
+            "aoe_deg": _rms(_turned_deg(estimate, truth)),
             "aoe_aligned_deg": aligned[0],
             "ape_m": _rms(p_est - p_true) if known else None,
             "ape_aligned_m": aligned[1],
@@ -111,7 +111,9 @@ def relative(
     estimate, truth = _scored(estimate, truth, valid)
     # With C = R_true R_est^T, R_true,i^T (dp_true - C_i dp_est) is the difference of motions, and C_i C_j^T that of their
     # rotations in another frame: length and angle are the same, for a fraction of the products.
-    C = quaternion.multiply(_unit(truth), quaternion.inverse(_unit(estimate)))
+    C = np.empty((len(truth), 4))
+    for rows, q, q_true in _units(estimate, truth):
+        C[rows] = quaternion.multiply(q_true, quaternion.inverse(q))
     roe: dict[str, float | None] = {}
     rpe: dict[str, float | None] = {}
     for distance_m in distances_m:
@@ -165,16 +167,21 @@ def pairs_by_distance(
     grows (evo searches every pair, minutes for 30 000 poses).
     """
     travelled = np.concatenate([[0.0], np.cumsum(quaternion.length(np.diff(p, axis=0)))])
-    i = np.arange(len(p) - 1)
-    above = np.searchsorted(travelled, travelled[i] + distance_m, side="left")
-    above = np.clip(above, i + 1, len(p) - 1)
-    below = np.searchsorted(travelled, travelled[above - 1], side="left")  # first of the points that share that distance
-    below = np.clip(below, i + 1, above)
-    miss_above = np.abs(travelled[above] - travelled[i] - distance_m)
-    miss_below = np.abs(travelled[below] - travelled[i] - distance_m)
-    j = np.where(miss_below <= miss_above, below, above)
-    near = np.minimum(miss_below, miss_above) <= distance_m * tolerance
-    return i[near], j[near]
+    pairs, count = np.empty((2, max(len(p) - 1, 0)), np.int64), 0
+    for first in range(0, len(p) - 1, AT_ONCE):
+        i = np.arange(first, min(first + AT_ONCE, len(p) - 1))
+        above = np.searchsorted(travelled, travelled[i] + distance_m, side="left")
+        above = np.clip(above, i + 1, len(p) - 1)
+        below = np.searchsorted(travelled, travelled[above - 1], side="left")  # first of the points that share that distance
+        below = np.clip(below, i + 1, above)
+        miss_above = np.abs(travelled[above] - travelled[i] - distance_m)
+        miss_below = np.abs(travelled[below] - travelled[i] - distance_m)
+        j = np.where(miss_below <= miss_above, below, above)
+        near = np.minimum(miss_below, miss_above) <= distance_m * tolerance
+        pairs[:, count : count + int(near.sum())] = i[near], j[near]
+        count += int(near.sum())
+    i, j = pairs[:, :count]
+    return i, j
 
 
 def pose_delay(path: Poses, truth: Poses, windows: Int64[np.ndarray, "m 2"]) -> tuple[float, float] | None:
@@ -242,9 +249,26 @@ def _scored(estimate: Poses, truth: Poses, valid: Mask) -> tuple[Poses, Poses]:
     return (estimate, truth) if valid.all() else (estimate.rows(valid), truth.rows(valid))
 
 
-def _unit(poses: Poses) -> Float64[np.ndarray, "n 4"]:
-    """Unit orientations in float64; the six decimals of a file would count as an angle."""
-    return quaternion.unit(poses.q_wb_wxyz)
+def _units(estimate: Poses, truth: Poses) -> Iterator[tuple[slice, Quaternions, Quaternions]]:
+    """Rows of a block and their unit orientations; the six decimals of a file would count as an angle."""
+    for first in range(0, len(truth), AT_ONCE):
+        rows = slice(first, first + AT_ONCE)
+        yield rows, quaternion.unit(estimate.q_wb_wxyz[rows]), quaternion.unit(truth.q_wb_wxyz[rows])
+
+
+def _turned_deg(estimate: Poses, truth: Poses, turn: Float64[np.ndarray, "1 4"] | None = None) -> Float64[np.ndarray, " n"]:
+    """Angles between the orientations of two trajectories, of which the first may be turned."""
+    out = np.empty(len(truth))
+    for rows, q, q_true in _units(estimate, truth):
+        out[rows] = np.degrees(quaternion.angle_between(q if turn is None else quaternion.multiply(turn, q), q_true))
+    return out
+
+
+def _apart(p: Points, shift: Float64[np.ndarray, "3"], p_true: Points) -> Points:
+    """Distances of points, which are overwritten, after a shift."""
+    p += shift
+    p -= p_true
+    return p
 
 
 def _rms(errors: Float64[np.ndarray, " n *k"]) -> float:

@@ -75,10 +75,11 @@ def dead_reckon(
     t = seconds(imu.t_ns, int(imu.t_ns[0]))
     dt = np.diff(t)[:, None]
     with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below with its row
-        steps = quaternion.exp(imu.gyro[:-1] * dt)
-        q_wb = quaternion.unit(quaternion.running_product(np.concatenate([quaternion.unit(q_0[None]), steps])))
-        a_w = quaternion.rotate(q_wb[:-1], imu.accel[:-1]) + np.asarray(g_w, dtype=np.float64)
-        v_w = np.cumsum(np.concatenate([v_0[None], a_w * dt]), axis=0)
+        q_wb = quaternion.running_product(np.concatenate([quaternion.unit(q_0[None]), quaternion.exp(imu.gyro[:-1] * dt)]))
+        q_wb /= quaternion.length(q_wb)[:, None]  # in place, as below: few arrays as long as the log at once
+        v_w = np.concatenate([v_0[None], quaternion.rotate(q_wb[:-1], imu.accel[:-1])])
+        np.multiply(np.add(v_w[1:], g_w, out=v_w[1:]), dt, out=v_w[1:])
+        np.cumsum(v_w, axis=0, out=v_w)
         p_wb = np.cumsum(np.concatenate([p_0[None], v_w[:-1] * dt]), axis=0)
     if not all(np.isfinite(column).all() for column in (q_wb, v_w, p_wb)):
         row = int(np.argmin(np.isfinite(np.concatenate([q_wb, v_w, p_wb], axis=1)).all(axis=1)))
@@ -211,8 +212,7 @@ def drift_windows(path: Poses, valid: Bool[np.ndarray, " n"], window_s: float) -
 
 def with_velocity(poses: Poses) -> Poses:
     """Trajectory with velocity: its own if it follows the positions, else `truth_velocity`."""
-    own = poses.v_w is not None and velocity_follows(poses)
-    return poses if own else replace(poses, v_w=truth_velocity(poses))
+    return poses if poses.v_w is not None and velocity_follows(poses) else replace(poses, v_w=truth_velocity(poses))
 
 
 def velocity_follows(poses: Poses) -> bool:

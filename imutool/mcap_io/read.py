@@ -208,9 +208,12 @@ class _Columns:
             yield run
 
     def columns(self, name: str, *widths: int) -> tuple[Int64[np.ndarray, " n"], list[Float64[np.ndarray, "n _"]]]:
-        if not (parts := self.kept.get(name, [])):
+        parts = self.kept.pop(name, []) if self.run.alone else self.kept.get(name, [])  # of one stretch nothing is asked twice
+        if not parts:
             return np.zeros(0, np.int64), [np.zeros((0, width)) for width in widths]
         stamp_ns, sequence, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+        for column in (stamp_ns, *columns) if self.run.alone else ():  # so that a recording needs no copy
+            column.flags.writeable = False
         rows = self.run.rows if name == self.imu_topic else self.run.rows_of(stamp_ns)
         StampCheck(rows.start, fix=CLEAN_FIX if name == self.imu_topic else "").check(stamp_ns[rows], sequence[rows])
         return stamp_ns[rows], [column[rows] for column in columns]

@@ -31,6 +31,8 @@ MISFIT = 3.5  # standard deviations at one averaging time that the sum may miss 
 NEEDED = 12.0  # rise of chi² when a power is taken out, below which it was not needed
 TOLD_APART = 4.0  # rise of chi² when a power makes way for its neighbour, below which it could be either
 CORRELATED = 1.7  # standard deviations of slopes beyond the white one: neighbouring averaging times share their samples
+LEAST_FREEDOM = 10.0  # degrees of freedom that an averaging time needs to bound a density from above
+BOUND_RISK = 0.002  # probability that one averaging time puts the bound too low
 HUBER = 2.0
 HALF = 0.5
 LEAST_TIMES = 3  # averaging times, an octave apart, that anything is fitted to
@@ -115,6 +117,22 @@ def freedom(tools: ModuleType, count: int, m: int) -> float:
     The smaller of those for white noise and for a random walk.
     """
     return max(1.0, min(float(tools.edf_simple(count + 1, m, alpha)) for alpha in (0, -2)))
+
+
+def density_bound(curve: Curve) -> list[float | None]:
+    """Upper bound of the white density by axis.
+
+    It is the least of deviation * sqrt(tau) with its confidence.
+    """
+    from scipy.special import gammaincinv
+
+    enough = curve.freedom >= LEAST_FREEDOM
+    if not enough.any():
+        return [None] * 3
+    freedom = curve.freedom[enough]
+    stretch = np.sqrt(freedom / (2.0 * gammaincinv(freedom / 2.0, BOUND_RISK)))  # the quantile of chi²
+    bounds = curve.deviation[enough] * (np.sqrt(curve.tau_s[enough]) * stretch)[:, None]
+    return [float(value) for value in bounds.min(axis=0)]
 
 
 def slopes(curve: Curve) -> list[Slopes]:

@@ -19,6 +19,7 @@ from imutool.inertial.stationary import GAP_PERIODS
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
 from imutool.inertial.windows import rotation_residual, velocity_residual
 from imutool.noise.allan import Curve, freedom, library
+from imutool.processes.system import release_memory
 from imutool.recording import Imu, Poses, seconds
 
 MAD = 1.4826  # of a normal distribution: its standard deviation over its median size
@@ -28,7 +29,7 @@ LEAST_WINDOWS = 9
 MOST_WINDOWS = 3000  # of one length, in runs of neighbours: the median is good to 2 per cent with as many
 RUN = 60
 TURNED = 1.0 / 3.0  # of T, the least singular value of G: a window that turns all the way round shows no constant
-MAX_SAMPLES = 200_000  # at once
+MAX_SAMPLES = 50_000  # at once
 
 Rows = Float64[np.ndarray, "n 3"]
 
@@ -50,16 +51,17 @@ def curves(imu: Imu, truth: Poses) -> tuple[Curve, Curve]:
     period_s = imu.period_s
     start = max(1, round(truth.period_s / period_s))  # shorter windows would lie between two poses
     broken = np.cumsum((np.diff(t, prepend=t[0]) > GAP_PERIODS * period_s) | ~trusted)
-    q_wb_wxyz = torch.from_numpy(np.array(poses.q_wb_wxyz))
-    R_wb = torch.cat([so3.matrix_from_quaternion_wxyz(part) for part in torch.split(q_wb_wxyz, MAX_SAMPLES)])
-    assert poses.v_w is not None
+    R_wb, v_w = so3.matrices_from_rows_wxyz(poses.q_wb_wxyz), poses.v_w
+    assert v_w is not None
+    del poses  # no array as long as the log stays when it is no longer needed
+    release_memory()
     found: tuple[list[Rows], list[Rows]] = ([], [])
     lengths, worth = [], []
     n, tools = start, library()
     while 2 * n < len(imu):
         hop = max(1, n // OVERLAP)
         first = _starts(len(imu), n, hop, broken)
-        gyro, accel = (_spread(imu, t, R_wb, poses.v_w, first, n, sensor) for sensor in ("gyro", "accel"))
+        gyro, accel = (_spread(imu, t, R_wb, v_w, first, n, sensor) for sensor in ("gyro", "accel"))
         if gyro is None or accel is None:
             break
         found[0].append(gyro)
@@ -97,10 +99,10 @@ def _spread(
     sensor: str,
 ) -> Float64[np.ndarray, "3"] | None:
     """Allan deviation of one sensor's error at one window length; None where too few windows can show it."""
+    if len(first) <= LEAST_WINDOWS:  # too few pairs of neighbours, and the longest windows take the most memory
+        return None
     at_once = max(1, MAX_SAMPLES // n)
     parts = [_error(imu, t, R_wb, v_w, first[k : k + at_once], n, sensor) for k in range(0, len(first), at_once)]
-    if not parts:
-        return None
     y, shown = (np.concatenate(column) for column in zip(*parts, strict=True))
     first, y = first[shown], y[shown]
     after = np.searchsorted(first, first + n)  # the window that begins where this one ends

@@ -87,9 +87,13 @@ def spread_stamps(t_ns: Int64[np.ndarray, " n"], starts: Int64[np.ndarray, " s"]
         return stamps
 
     ahead = placed(np.append(steps, np.inf) / count, behind)
+    if steps[0] <= GAP_STEPS * median(steps):  # no gap: a first stamp with fewer samples had begun before the recording
+        late = int(steps[0] - np.rint(usual[0] * count[0]))
+        ahead[: count[0]] += max(0, late) if steps[0] > GAP_STEPS * usual[0] * count[0] else 0
     back = placed(np.append(np.inf, steps) / count, behind - each + 1)
-    of_row = np.repeat(usual, count)[1:]
-    uneven = [np.minimum(np.abs(np.diff(stamps) / of_row - 1.0), 1.0).sum() for stamps in (ahead, back)]
+    moved = np.diff(ahead) != np.diff(back)
+    of_row = np.repeat(usual, count)[1:][moved]
+    uneven = [np.minimum(np.abs(np.diff(stamps)[moved] / of_row - 1.0), 1.0).sum() for stamps in (ahead, back)]
     is_back = bool(uneven[1] < CLEARLY * uneven[0] - 1.0)
     return (back if is_back else ahead), is_back
 

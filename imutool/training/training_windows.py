@@ -95,12 +95,13 @@ class Pool:
             listed = ", ".join(f"{pool.names[0]} {pool.rate_hz:.1f}" for pool in pools)
             wanted, fix = "logs of one sensor at one rate", "Train a model for each rate, or restamp logs whose stamps jitter"
             raise DataError(f"training logs at different rates ({listed} Hz)", expected=wanted, fix=fix)
+        if len(pools) == 1:
+            return pools[0]
         columns = {name: torch.cat([getattr(pool, name) for pool in pools]) for name in ("t", *SAMPLED, *FLAGS, "floors")}
-        log = torch.cat([pool.log + i for i, pool in enumerate(pools)])
         return cls(
             names=tuple(pool.names[0] for pool in pools),
             rate_hz=float(np.median(rates)),
-            log=log,
+            log=torch.cat([pool.log + i for i, pool in enumerate(pools)]),
             spans_ns=tuple(pool.spans_ns[0] for pool in pools),
             sensors=min((pool.sensors for pool in pools), key=len),
             **columns,
@@ -113,12 +114,10 @@ class Pool:
             both = recording.overlap()
         except DataError as error:
             raise error.at(recording.name) from error
-        imu = both.imu
-        poses, trusted = with_velocity(both.truth).at(imu.t_ns)
+        imu, (poses, trusted) = both.imu, with_velocity(both.truth).at(both.imu.t_ns)
         t = seconds(StretchClock()(imu.t_ns), int(imu.t_ns[0]))
-        R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz)))
         flags = (trusted, t > (1 - HELD_OUT) * t[-1], np.diff(t, prepend=t[0]) > GAP_PERIODS * imu.period_s)
-        sampled = (imu.gyro, imu.accel, R_wb, poses.v_w, poses.p_wb)
+        sampled = {"gyro": imu.gyro, "accel": imu.accel, "v_w": poses.v_w, "p_wb": poses.p_wb}
         return cls(
             names=(recording.name,),
             rate_hz=1.0 / imu.period_s,
@@ -127,7 +126,8 @@ class Pool:
             t=torch.tensor(t, dtype=dtype, device=device),
             log=torch.zeros(len(t), dtype=torch.long, device=device),
             floors=torch.tensor([floors.of(recording.kind_of(next(iter(recording.truths))))], dtype=dtype, device=device),
-            **{name: torch.tensor(np.asarray(x), dtype=dtype, device=device) for name, x in zip(SAMPLED, sampled, strict=True)},
+            R_wb=so3.matrices_from_rows_wxyz(poses.q_wb_wxyz).to(device, dtype),
+            **{name: torch.tensor(x, dtype=dtype, device=device) for name, x in sampled.items()},
             **{name: torch.tensor(x, device=device) for name, x in zip(FLAGS, flags, strict=True)},
         )
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from support import pool_functions
 from support.loaded import loaded
 from support.processes import below
+from support.tables import write_csv
 
 import imutool as imutool_api
 from imutool import registry
@@ -336,6 +337,7 @@ def test_converting_needs_no_torch():
         (b'<?xml version="1.0" encoding="UTF-8"?>\n<mvnx version="4">', "Xsens MVN.*sensors measured"),
         (b"\x80\x04\x95\x0f\x00\x00\x00\x00\x00\x00\x00}\x94\x8c\x03acc\x94K\x01s.", "pickle of Python.*numpy.savez"),
         (b"\x02P,\x00", "C3D file.*beside the table"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:5f5b\nsize 42586\n", "pointer of Git LFS.*git lfs pull"),
         (b"neither one nor the other", "no sequence found; expected a ROS bag"),
     ],
 )
@@ -343,6 +345,29 @@ def test_a_format_that_is_known_but_not_read_says_what_to_do(start: bytes, said:
     (tmp_path / "flight.dat").write_bytes(start + bytes(3000))
     with pytest.raises(DataError, match=said):
         convert(tmp_path / "flight.dat", tmp_path / "out.mcap")
+
+
+def test_recordings_of_one_name_say_which_file_they_are_of(tmp_path: Path) -> None:
+    """A folder's only table has the folder's name, and recordings of one table that of the table."""
+    names = ["trial", "time_s", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    rows = [[trial, n / 100, 0.1, 0.2, 0.3, 0.0, 0.0, 9.81 + 0.01 * (n % 3)] for trial in (1, 2) for n in range(50)]
+    whole, one = ([np.array(column) for column in zip(*part, strict=True)] for part in (rows, rows[:50]))
+    for folder, file in (("day1/path2", "left"), ("day2/path2", "right"), ("A", "rest"), ("B", "rest")):
+        (tmp_path / folder).mkdir(parents=True)
+        write_csv(tmp_path / folder / f"{file}.csv", names[1:], one[1:])
+    for folder in ("A", "B"):
+        write_csv(tmp_path / folder / "all.csv", names, whole)
+    written = convert(tmp_path, tmp_path / "out", workers=1).written
+    expected = [f"{folder}_{name}" for folder in "AB" for name in ("all_trial_1", "all_trial_2", "rest")]
+    assert sorted(path.stem for path in written) == [*expected, "day1_path2_left", "day2_path2_right"]
+
+
+def test_a_folder_without_a_recording_says_of_which_format_most_of_its_known_files_are(tmp_path: Path) -> None:
+    for number in (1, 2, 3):
+        (tmp_path / f"imu{number}.mat").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:5f5b\nsize 4\n")
+    (tmp_path / "film.mp4").write_bytes(b"\x00\x00\x00\x14ftypmp41" + bytes(100))
+    with pytest.raises(DataError, match=r"of imu1\.mat and 2 others, it is a pointer of Git LFS.*git lfs pull"):
+        convert(tmp_path, tmp_path / "out")
 
 
 def test_a_folder_of_own_logs_alone_can_be_converted_again_but_never_what_it_wrote_itself(source, tmp_path):

@@ -622,3 +622,28 @@ def test_raw_counts_beside_calibrated_samples_are_no_imu(tmp_path):
     log = table.read_sequence(found)
     assert [*log.imus] == ["/si_1_calibrated/imu", "/si_2_calibrated/imu"]
     assert {tuple(imu.gyro[0]) for imu in log.imus.values()} == {(0.0, 0.0, 0.1)}
+
+
+@pytest.mark.parametrize(
+    "above",
+    [
+        "# Units: ax/ay/az=g, gx/gy/gz=deg/s\n",
+        "% a board\n% gx, gy, gz in deg/s; AX, AY, AZ in g\n",
+        "// gx,gy,gz [dps]  ax,ay,az [g]\n",
+    ],
+)
+def test_units_in_a_comment_above_the_header_count(tmp_path, above):
+    names = ["time_ms", "ax", "ay", "az", "gx", "gy", "gz"]
+    path = write_csv(tmp_path / "board.csv", names, [10 * np.arange(COUNT), *ACCEL.T, *GYRO.T], above=above)
+    log = table.read_sequence(table.sequences(path)[0])
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, np.deg2rad(GYRO))
+    np.testing.assert_allclose(log.imus["/imu0"].accel, 9.80665 * ACCEL)
+    assert "gx, gy, gz in deg/s, by a comment above the table" in log.remarks.notes
+
+
+def test_a_comment_that_names_no_column_or_no_unit_of_it_states_none(tmp_path):
+    names = ["time_ms", "ax", "ay", "az", "gx", "gy", "gz"]
+    above = "# gx: general, x in g mode (see wx,wy,wz=deg/s)\n# range: 2000 dps, rate in Hz\n"
+    path = write_csv(tmp_path / "board.csv", names, [10 * np.arange(COUNT), *ACCEL.T, *GYRO.T], above=above)
+    with pytest.raises(ConfigError, match="no unit of the gyro"):
+        table.read_sequence(table.sequences(path)[0])

@@ -166,7 +166,7 @@ def test_of_a_table_of_one_sensor_x_y_and_z_are_the_axes(tmp_path):
     t_us, zero = 1e6 * T_S, np.zeros((COUNT, 3))
     for sensor, values in (("gyro", GYRO), ("accel", ACCEL)):
         columns = np.column_stack([t_us, t_us - 100, zero, values])
-        np.savetxt(tmp_path / f"sensor_{sensor}_0.csv", columns, header=",".join(names), delimiter=",", comments="")
+        np.savetxt(tmp_path / f"my_{sensor}_0.csv", columns, header=",".join(names), delimiter=",", comments="")
     (sequence,) = table.sequences(tmp_path)
     with pytest.raises(ConfigError) as refused:
         table.read_sequence(sequence)
@@ -465,3 +465,22 @@ def test_sensors_of_two_files_share_the_time_since_1970_and_not_the_one_since_th
         9.80665 * np.stack([np.sin(turn := np.interp(imu.t_ns * 1e-9, T_S + 0.035, TURN)), 0.0 * turn, np.cos(turn)], axis=1),
         atol=1e-3,
     )
+
+
+def test_pairs_that_last_differently_are_recordings_of_their_own(tmp_path):
+    """As Sensor Kinetics names them, with a time from 0; they were IMUs of one log."""
+    t_s = np.arange(2 * COUNT) / 100.0
+    values = {"gyrm": np.tile(GYRO, (2, 1)), "accm": np.tile(ACCEL, (2, 1)), "magm": np.tile(ACCEL, (2, 1))}
+    for name, count in (("walk_f_1", COUNT), ("walk_f_2", 2 * COUNT)):
+        for sensor, each in values.items():
+            text = "time,X_value,Y_value,Z_value\n" + rows(t_s[:count], each[:count])
+            (tmp_path / f"{name}_{sensor}.csv").write_text(text)
+    found = table.sequences(tmp_path)
+    assert [sequence.name for sequence in found] == ["walk_f_1", "walk_f_2"]
+    logs = [table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"}) for sequence in found]
+    assert [len(log.imus["/imu0"]) for log in logs] == [COUNT, 2 * COUNT]
+    assert "/walk_f_1_magm_X_value" in logs[0].scalars
+    for sensor, each in values.items():
+        (tmp_path / f"walk_f_1_{sensor}.csv").write_text("time,X_value,Y_value,Z_value\n" + rows(t_s, each))
+    (together,) = table.sequences(tmp_path)
+    assert len(table.read_sequence(together, mapping={"gyro_unit": "rad/s"}).imus) == 2

@@ -174,7 +174,7 @@ def test_numbered_matrices_of_a_motion_about_one_axis_are_asked(tmp_path, late_s
     (tmp_path / "imu.csv").write_text(IMU_HEADER + rows(1e9 * T_S, gyro, 0.0 * gyro + [0.0, 0.0, 9.8]))
     log = read(tmp_path)
     assert log.poses == {}
-    assert any("or so do their transposes; `rotation_matrix` of a map" in note for note in log.remarks.notes)
+    assert any("nor do their transposes; `rotation_matrix` of a map" in note for note in log.remarks.notes)
 
 
 def sensor_tables(folder: Path, names: tuple[str, str], epoch_s: int = 0) -> None:

@@ -14,7 +14,7 @@ import scipy.io
 from support.spreadsheet import write_xlsx
 from support.tables import write_csv
 
-from imutool.converters import table
+from imutool.converters import _table_parts, table
 
 COUNT, PARTS, RATE_HZ = 200, 3, 50.0
 RNG = np.random.default_rng(7)
@@ -174,6 +174,23 @@ def test_groups_in_groups_are_recordings_with_both_names(tmp_path: Path) -> None
     ]
 
 
+def test_what_lies_beside_the_groups_of_recordings_is_in_every_one(tmp_path: Path) -> None:
+    """As a time that all have, and numbers of the sensor."""
+    with h5py.File(tmp_path / "all.h5", "w") as file:
+        file["data/time_s"] = T_S[:COUNT]
+        file["data/sensor/range"] = np.arange(3.0)
+        for number, name in enumerate(["trial_1", "trial_2"], 1):
+            for array, values in part(number).items():
+                if array != "time_s":
+                    file[f"data/{name}/{array}"] = values
+    read = [table.read_sequence(each) for each in table.sequences(tmp_path / "all.h5")]
+    assert [log.name for log in read] == ["all_trial_1", "all_trial_2"]
+    for number, log in enumerate(read, 1):
+        np.testing.assert_array_equal(log.imus["/imu0"].gyro, GYRO[number == PART])
+        np.testing.assert_allclose(log.imus["/imu0"].t_ns, T_S[:COUNT] * 1e9)
+        assert log.metadata["imutool/constants"] == {"data/sensor/range": "[0.0, 1.0, 2.0]"}
+
+
 def structures(kind: str) -> Arrays:
     each = [part(number, rows=COUNT - 10 * number) for number in range(1, PARTS + 1)]
     match kind:
@@ -301,3 +318,16 @@ def test_a_folder_finds_files_that_hold_several_recordings(tmp_path: Path) -> No
         *(f"one_trial_{n}" for n in (1, 2, 3)),
         *(f"two_trial{n}" for n in (1, 2, 3)),
     ]
+
+
+@pytest.mark.parametrize("write", [as_npz, as_mat, as_hdf5])
+def test_arrays_that_can_be_of_one_recording_alone_are_not_read_to_list_it(
+    tmp_path: Path, write: Callable[[Path, Arrays], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"one.{ENDINGS.get(write, 'mat')}"
+    write(path, {"time_s": T_S[:COUNT]} | {name: each[:COUNT] for name, each in NAMES.items()})
+    monkeypatch.setattr(_table_parts, "load", lambda *_: pytest.fail("read"))
+    assert [each.name for each in table.sequences(path)] == ["one"]
+    write(path, {"trial": PART} | NAMES)
+    with pytest.raises(pytest.fail.Exception, match="read"):
+        table.sequences(path)

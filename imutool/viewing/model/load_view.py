@@ -21,6 +21,7 @@ from imutool.file_location import Location
 from imutool.inertial.aids import Aids, listed, parse_aids
 from imutool.inertial.metrics import evaluate
 from imutool.inertial.strapdown import StartPose, gaps_crossed, stretch_with_truth, with_velocity
+from imutool.processes.system import release_memory
 from imutool.recording import Poses, Recording, Scalars, seconds
 from imutool.viewing.model.events import Event, events_within, finding_events, stop_events, survey_events, worst_error_events
 from imutool.viewing.model.read_log import read_log
@@ -62,6 +63,7 @@ def load(
     """
     asked = None if aid is None else parse_aids(aid)
     contents = read_log(log, imu=imu, truth=truth)
+    release_memory()
     recording = contents.recording
     if recording.truths:
         recording = recording.with_truth(truth or next(iter(recording.truths)))
@@ -89,6 +91,7 @@ def load(
         events=events,
         notes=[*contents.notes, *notes],
     )
+    release_memory()
     settings = {"start": init, "smooth": "yes"} if smooth else {"start": init} if models else {}
     return replace(
         data,
@@ -213,6 +216,7 @@ def _scored(runs: Sequence[Run], truth: Poses, where: str, align: Alignment) -> 
     for k, run in enumerate(runs):
         alike = k > 0 and np.array_equal(run.imu.t_ns, runs[k - 1].imu.t_ns)
         known.append(known[-1] if alike else TruthSpan(*stretch_with_truth(run.imu.t_ns, truth, where)))
+    release_memory()
     with ThreadPoolExecutor() as pool:  # nearly all of it is numpy's, which lets other threads work
         scored = list(pool.map(partial(_score, align=align), runs, known))
     traces, motions = tuple(trace for trace, _ in scored), [motion for _, motion in scored if motion]

@@ -168,6 +168,8 @@ def _columns(batches: Sequence[ImuBatch]) -> tuple[Imu, LogTimes]:
     gyro, accel = (
         np.concatenate([np.zeros((0, 3)), *(getattr(batch, name) for batch in batches)]) for name in ("gyro", "accel")
     )
+    for column in (stamp_ns, gyro, accel):  # so that the samples need no copy
+        column.flags.writeable = False
     return Imu(stamp_ns, gyro, accel), LogTimes(stamp_ns, log_ns)
 
 

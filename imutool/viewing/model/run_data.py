@@ -57,7 +57,7 @@ class Run:
     @classmethod
     def raw(cls, imu: Imu) -> Run:
         """Run of the IMU as recorded."""
-        zeros = np.zeros_like(imu.gyro)
+        zeros = np.zeros(imu.gyro.shape)  # without memory until one is changed
         return cls(RAW, imu, zeros, zeros)
 
     @property
