@@ -1,4 +1,4 @@
-"""Curve of the motion in closed form: W u + V x, with x the outputs of hidden layers that stay as they were drawn.
+"""Curve of the motion in closed form, W u + V x, behind layers that stay as they were drawn.
 
 The curve is linear in W and V. A descent on batches ends about their minimum, where the noise of the batches takes
 combinations that the motion hardly shows to and fro. Least squares have one minimum, and features that were drawn predict
@@ -28,9 +28,9 @@ WEIGHT_PRIOR = 0.3  # of a weight, in the unit of the curve: chosen by left-out 
 
 @torch.no_grad()
 def solve_last_layer(model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float[Tensor, "logs 6"]) -> None:
-    """Solve for the last layer of a sensor's motion bias, where the model has one and left-out logs want it.
+    """Solve for the last layer of a sensor's motion bias, where left-out logs want it.
 
-    The training parts of the logs count. `rest` are their rest biases.
+    Only the training parts of the logs count. `rest` are their rest biases.
 
     Raises:
         DataError: a log without a window that is free of gaps.
@@ -49,7 +49,8 @@ def solve_last_layer(model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float
     width = values.shape[1]
     std = torch.full((3, width), WEIGHT_PRIOR).to(values)
     std[:, :3] = W_PRIOR
-    problem = linearise(Seen(pool, sensor, gyro), Terms(values, None, std.flatten() ** -2.0), "train")
+    by_axis = torch.eye(3 * width).to(values).reshape(3, width, 3 * width)
+    problem = linearise(Seen(pool, sensor, gyro), Terms(values, by_axis, std.flatten() ** -2.0), "train")
     every = range(len(problem.theta))
     matrix = [k for k in every if k % width < 3]
     if gain_of(*(problem.predicted(columns, by_scatter=True) for columns in (every, matrix))) < LEAST_GAIN:

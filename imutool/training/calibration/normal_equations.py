@@ -173,21 +173,12 @@ class Seen(NamedTuple):
 class Terms(NamedTuple):
     """Errors that are linear in parameters theta, the product of `pattern` and the values.
 
-    Without a pattern each axis has a parameter for every value. `prior` is one over the variance of each, about zero.
+    `prior` is one over the variance of each parameter, about zero.
     """
 
     values: Float[Tensor, "n q"]
-    pattern: Float[Tensor, "3 q p"] | None
+    pattern: Float[Tensor, "3 q p"]
     prior: Float[Tensor, " p"]
-
-    def error(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "n 3"]:
-        """Error at each sample."""
-        by_value = theta.reshape(3, -1).mT if self.pattern is None else torch.einsum("iqp,p->qi", self.pattern, theta)
-        return self.values @ by_value
-
-    def by_theta(self, S: Float[Tensor, "m 3 3 q"]) -> Float[Tensor, "m 3 p"]:
-        """Derivative by the parameters, from sums of the values times a derivative by each axis."""
-        return S.flatten(2) if self.pattern is None else torch.einsum("mijq,jqp->mip", S, self.pattern)
 
     @classmethod
     def of(cls, effects: Sequence[LinearForm], signals: Signals, sensors: SensorPrior, pool: Pool) -> Terms:
@@ -225,7 +216,7 @@ def linearise(seen: Seen, terms: Terms, part: Part, own_prior: Float[Tensor, " o
     for step in range(len(sets) + MOST_STEPS):
         fit = judged = Equations(*(prior.new_zeros(logs, *shape) for shape in ((unknowns, unknowns), (unknowns,), ())))
         size = seen.pool.least(seen.sensor)
-        true_u = samples - terms.error(theta) - own[seen.pool.log, :3]
+        true_u = samples - terms.values @ torch.einsum("iqp,p->qi", terms.pattern, theta) - own[seen.pool.log, :3]
         prefix = _prefix(seen, pieces, terms, true_u, turned)
         for windows, row in list(zip(sets, rows, strict=True))[: step + 1]:
             equations, size = _equations(seen, windows, prefix.across(*row), true_u, own, size)
@@ -258,7 +249,7 @@ def _prefix(seen: Seen, pieces: Pieces, terms: Terms, true_u: Float[Tensor, "n 3
             turned[number] = turns
         A = derivative_by_sample(seen.sensor, turns, dt)
         S = A.flatten(2).mT @ terms.values[index]
-        by_theta = terms.by_theta(S.reshape(len(S), 3, 3, S.shape[2]))
+        by_theta = torch.einsum("mijq,jqp->mip", S.reshape(len(S), 3, 3, S.shape[2]), terms.pattern)
         by_all = torch.einsum("mkij,mkj->mi", A, true_u[index])
         return turns[:, -1], torch.cat([by_theta, A.sum(1), by_all[..., None]], dim=2)
 

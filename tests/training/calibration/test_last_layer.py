@@ -28,7 +28,8 @@ def shaped(seed: int, rate_hz: float) -> neural_ode.Network:
     torch.manual_seed(seed)
     network = neural_ode.Network(rate_hz=rate_hz).double()
     for sensor in SENSORS:
-        assert (layer := network.last_layer(sensor)) is not None
+        layer = network.last_layer(sensor)
+        assert layer is not None
         assert layer.out.shape == (3, network.config.curve_width)
         layer.out.normal_(0.0, PLANTED)
         layer.W.normal_(0.0, 0.01)
