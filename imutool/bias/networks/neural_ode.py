@@ -120,12 +120,13 @@ class Network(BiasNetwork):
         if self.config.paper:
             return None
         curve = _part(self.curve, sensor, Curve)
+        last = _part(curve.net, "4", nn.Linear)
 
         def inputs(segment: Segment) -> Float[Tensor, "batch n width"]:
             u, _ = segment.of(sensor)
             return curve.hidden(u, self._filtered(u, SLOW_S))
 
-        return LastLayer(curve.W, curve.net[-1].weight, inputs)
+        return LastLayer(curve.W, last.weight, inputs)
 
     def rest_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
         """beta at each sample, linear between the steps of the drift; in the paper's scheme the whole bias."""

@@ -55,6 +55,6 @@ def solve_last_layer(model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float
     matrix = [k for k in every if k % width < 3]
     if gain_of(*(problem.predicted(columns, by_scatter=True) for columns in (every, matrix))) < LEAST_GAIN:
         return
-    W, out = problem.solve_by_scatter(every).theta.reshape(3, width).split((3, width - 3), dim=1)
-    layer.W.copy_(W)
-    layer.out.copy_(out)
+    theta = problem.solve_by_scatter(every).theta.reshape(3, width)
+    layer.W.copy_(theta[:, :3])
+    layer.out.copy_(theta[:, 3:])
