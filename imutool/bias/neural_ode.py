@@ -8,10 +8,11 @@ time scales differ by four orders of magnitude::
 
 *C*, the curve, is the part that the motion adds: scale, misalignment, curvature. Its term generalizes the paper's term for a
 linear sensor, (I - A^{-1}) du/dt (after eq. 31), to any smooth sensor. As a total derivative it integrates to C exactly, with
-every solver and step. C also depends on the samples filtered over 0.1 s (ds/dt = (u - s) / tau, solved exactly), for sensors
-whose error lags their motion. *g*, the drift, moves the rest bias beta = b - C, the turn-on bias of a run; its scale makes it
-slow. It is a residual perceptron of the paper's size, integrated along the samples filtered over half a second, so the step of
-the solver changes the solution only by its own error. So b(t) = beta(t) + C(t).
+every solver and step. Its hidden layers stay as they were drawn, and what follows them is least squares
+(`imutool.training.calibration.last_layer`). C also depends on the samples filtered over 0.1 s (ds/dt = (u - s) / tau, solved
+exactly), for sensors whose error lags their motion. *g*, the drift, moves the rest bias beta = b - C, the turn-on bias of a
+run; its scale makes it slow. It is a residual perceptron of the paper's size, integrated along the samples filtered over half a
+second, so the step of the solver changes the solution only by its own error. So b(t) = beta(t) + C(t).
 
 A drift that lags behind what warms or strains the sensor (`gyro_rate_load` and others of `imutool.sensor.effects`) has its own
 states, dz/dt = (g(u) - z) / tau: of the rest bias alone a field cannot tell what stays from what decays. They are fitted in

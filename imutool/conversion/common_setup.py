@@ -115,16 +115,10 @@ def fitted_to(path: Path, common: Corrections) -> Corrections | None:
         notes = dict.fromkeys(common.imus, f"units and axes are now {SAID}")
         if not common.pose_topic:
             return replace(common, reflected=own_types, notes=notes)
-        kept = list[str]()
-        if (
-            common.late_ns
-            and log.imu_topics
-            and contradicts_delay(log, log.imu_topics[0], common.pose_topic, common.late_ns * 1e-9)
-        ):
-            said = lateness(common.late_ns * 1e-9)
-            kept.append(
-                f"{common.pose_topic} keeps its clock: in the other logs it is {said}, which its own motion contradicts"
-            )
+        kept, late_s = list[str](), common.late_ns * 1e-9
+        if late_s and log.imu_topics and contradicts_delay(log, log.imu_topics[0], common.pose_topic, late_s):
+            of_others = f"in the other logs it is {lateness(late_s)}, which its own motion contradicts"
+            kept.append(f"{common.pose_topic} keeps its clock: {of_others}")
             common = replace(common, late_ns=0)
         turned = None if _is_identity(common.body.turn) else body_of(log, common.pose_topic, common.body.turn)
         frame_id = next(log.pose_batches(common.pose_topic)).frame_id

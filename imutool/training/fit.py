@@ -20,17 +20,18 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from imutool import registry
 from imutool.array_types import Float, Int
-from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.threads import of_each
 from imutool.config import build
-from imutool.errors import ConfigError, DataError, NumericsError
+from imutool.errors import ConfigError, NumericsError
 from imutool.recording import Recording
 from imutool.training import bias_spread
 from imutool.training.calibration import closed_form
+from imutool.training.calibration.last_layer import solve_last_layer
+from imutool.training.held_out import held_out_errors
 from imutool.training.log_signals import begin_at
 from imutool.training.objectives.increments import IncrementObjective
-from imutool.training.objectives.objective import BATCH_SAMPLES, AdamW, Objective, RestBiases, WindowEndObjective, error
+from imutool.training.objectives.objective import AdamW, Objective, RestBiases, WindowEndObjective
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.training.training_windows import Pool, corrected, sensors_up_to
 from imutool.units import Sensor
@@ -38,8 +39,6 @@ from imutool.units import Sensor
 __all__ = ["Epoch", "Stage", "TrainSettings", "Training"]
 
 OBJECTIVES: dict[str, type[Objective]] = {"window_ends": WindowEndObjective, "increments": IncrementObjective}
-LONGEST_HELD_OUT_S = {"gyro": 20.0, "accel": 5.0}
-HELD_OUT_HOP_S = 1.0
 WARM_UP_STEPS = 20
 AVERAGE_STEPS = 30  # over which weights are averaged
 SEED_STRIDE = 1_000_003  # between the seeds of two steps
@@ -157,37 +156,8 @@ class Training:
         return float(errors.sort().values[: max(1, int(TRIM * len(errors)))].mean())
 
     def held_out_errors(self, sensor: Sensor, model: BiasNetwork) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:
-        """Errors over the longest windows that fit the held-out parts (rad or m/s), and the log of each.
-
-        Each log's constant is solved for on that part first: it belongs to the run, and what is judged here is the sensor.
-        """
-        first, n = self._held_out_windows(sensor)
-        rest, lengths = self.tracks.per_log().detach(), self.settings.window_s[sensor][:2]
-        columns = COLUMNS[sensor]
-        rest[:, columns] = model.rest_at_work(sensor, rest[:, columns])
-        scored, pool = corrected(model, self.pool, "held_out", sensors_up_to(sensor))
-        solved = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, part="held_out", nuisances=False)
-        rest[:, columns] = solved.rest
-        with torch.no_grad():
-            parts = torch.split(first, max(1, BATCH_SAMPLES // n))
-            errors = of_each(lambda some: error(scored, sensor, pool.windows(some, n, rest[pool.log[some]])), parts)
-        return torch.cat(errors), pool.log[first]
-
-    def _held_out_windows(self, sensor: Sensor) -> tuple[Int[Tensor, " m"], int]:
-        pool, window_s, of_log = self.pool, LONGEST_HELD_OUT_S[sensor], [torch.empty(0)] * len(self.pool.names)
-        while window_s > 0.1:
-            n = pool.samples(window_s)
-            first = pool.starts(n, "held_out", ends_only=True)
-            of_log = [first[pool.log[first] == i][:: pool.samples(HELD_OUT_HOP_S)] for i in range(len(pool.names))]
-            if all(len(part) for part in of_log):
-                return torch.cat(of_log), n
-            window_s *= 0.8
-        raise DataError(
-            "the last fifth of the log holds no stretch of truth",
-            where=", ".join(name for name, part in zip(pool.names, of_log, strict=True) if not len(part)),
-            expected="truth to the end of each log",
-            fix="Leave that log out or cut it",
-        )
+        """Errors over the longest windows that fit the held-out parts (rad or m/s), and the log of each."""
+        return held_out_errors(model, sensor, self.pool, self.tracks.per_log().detach(), self.settings.window_s[sensor][:2])
 
     def _closed_form(self, sensor: Sensor) -> None:
         """Calibration and rest biases, as far as windows and a matrix show them."""
@@ -197,6 +167,7 @@ class Training:
         if sensor not in self._constant:
             solution = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=True)
             begin_at(self.model, sensor, solution, self.pool.sensors)
+            solve_last_layer(self.model, sensor, self.pool, rest)
         # constants that take the nuisances of their logs: the descent knows none
         scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
         constants = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, nuisances=False)
@@ -204,7 +175,7 @@ class Training:
 
     def begin(self, sensor: Sensor) -> Stage:
         """Fresh stage from the current model and tracks: it moves the sensor's weights and the tracks."""
-        weights = {name: w for name, w in self.model.named_parameters() if f".{sensor}" in f".{name}"}
+        weights = self._moved(sensor)
         free = [w for name, w in weights.items() if name.startswith(self.model.undecayed)]
         groups = [
             ([w for name, w in weights.items() if not name.startswith(self.model.undecayed)], self.settings.weight_decay),
@@ -215,6 +186,11 @@ class Training:
         mean = AveragedModel(self.model.eval(), multi_avg_fn=average, use_buffers=True)
         objective = OBJECTIVES[self.model.objective](self.model, sensor, self.pool, self.tracks, self.settings)
         return Stage(sensor, AdamW(groups), mean, objective)
+
+    def _moved(self, sensor: Sensor) -> dict[str, Tensor]:
+        """Weights of a sensor that a descent moves: those that no closed form gives."""
+        named = {name: w for name, w in self.model.named_parameters() if f".{sensor}" in f".{name}"}
+        return {name: w for name, w in named.items() if w.requires_grad}
 
     def _rate(self, sensor: Sensor) -> float:
         return self.settings.gyro_rate if sensor == "gyro" else self.settings.accel_rate
@@ -234,7 +210,7 @@ class Training:
             loss = self._one_step(stage)
 
     def _steps(self, sensor: Sensor) -> int:
-        return self.settings.steps if self.model.iterative else 0
+        return self.settings.steps if self.model.iterative and self._moved(sensor) else 0
 
     def _rate_at(self, stage: Stage) -> float:
         sensor, warm = stage.sensor, min(1.0, (stage.step + 1) / WARM_UP_STEPS)

@@ -35,7 +35,7 @@ from imutool.sensor.samples import SensorSamples
 from imutool.sensor.signals import LOAD, LOAD_TAU_S, LOADS, Load, SignalFilter, Signals
 from imutool.training.calibration.closed_form import Solution
 from imutool.training.calibration.log_scatter import CLOCK, LEVER, ROTATION, Integrated, integrated, minus_log_likelihood
-from imutool.training.calibration.normal_equations import Problem, Seen, linearise
+from imutool.training.calibration.normal_equations import Problem, Seen, Terms, linearise
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Pool
 from imutool.units import AXES, Sensor
@@ -173,7 +173,8 @@ def loaded_signals(
     forms = catalogue.trained("gyro", None if names is None else [name for name in names if name not in temperature.EFFECTS])
     if not any(_behind_load(form) for form in forms):
         return signals, loads
-    problem = linearise(Seen(pool, "gyro", signals, pool.gyro, sensors), (*forms, linear_form(DECAY, "gyro")), "train")
+    terms = Terms.of((*forms, linear_form(DECAY, "gyro")), signals, sensors, pool)
+    problem = linearise(Seen(pool, "gyro", pool.gyro), terms, "train")
     tried = [_loads(recording, pool.rate_hz) for recording in recordings]
     times = _likeliest(problem, [[_decay_matrix(forms, load) for load in some] for some in tried])
     loads = [some[time] if time != COLD else None for some, time in zip(tried, times, strict=True)]

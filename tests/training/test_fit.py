@@ -35,7 +35,7 @@ TINY = TrainSettings(
     steps=6,
     validate_every=2,
     track_knot_s=4.0,
-    model={"curve_width": 8, "drift_step_s": 0.1},
+    model={"curve_width": 8, "drift_step_s": 0.1, "drift": ["gyro", "accel"]},
 )
 LINEAR = TrainSettings(gyro_window_s=(0.5, 2.0), accel_window_s=(0.5, 1.0))
 
@@ -84,6 +84,11 @@ def test_the_gyro_goes_first_and_every_line_says_how_far(uninterrupted: tuple[Tr
     assert all(epoch.left_s >= 0.0 for epoch in epochs)
     assert set(training.done) == {"gyro", "accel"}
     assert not any(weight.requires_grad for weight in training.model.parameters())
+
+
+def test_a_sensor_without_a_drift_takes_no_steps(recordings: list[Recording]) -> None:
+    epochs = finish(Training(recordings, "neural_ode", settings(model={"curve_width": 8})))
+    assert [(epoch.sensor, epoch.step) for epoch in epochs] == [*(("gyro", k) for k in (0, 2, 4, 6)), ("accel", 0)]
 
 
 def test_one_seed_gives_the_same_bits(recordings: list[Recording], uninterrupted: tuple[Training, list[Epoch]]) -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import msgspec
 import torch
@@ -35,6 +35,17 @@ class Segment:
     def of(self, sensor: Sensor) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch 3"]]:
         """Samples and rest bias of one sensor."""
         return (self.gyro if sensor == "gyro" else self.accel), self.rest[:, COLUMNS[sensor]]
+
+
+class LastLayer(NamedTuple):
+    """Weights in which a sensor's motion bias is linear, W u + out x.
+
+    u are the samples, x the inputs of the layer in the unit of the bias.
+    """
+
+    W: Float[Tensor, "3 3"]
+    out: Float[Tensor, "3 k"]
+    inputs: Callable[[Segment], Float[Tensor, "batch n k"]]
 
 
 class BiasNetwork(nn.Module, ABC):
@@ -82,6 +93,10 @@ class BiasNetwork(nn.Module, ABC):
     @abstractmethod
     def motion_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
         """Part of a sensor's bias that follows from the samples alone, whatever the rest bias. Differentiable."""
+
+    def last_layer(self, sensor: Sensor) -> LastLayer | None:
+        """Last layer of the motion bias, where it is solved for in closed form after the descent."""
+        return None
 
     def rest_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
         """Rest bias of one sensor at each sample: constant unless a model lets it drift. Differentiable."""

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from imutool.array_types import Float
-from imutool.bias.networks.network import BiasNetwork, Segment
+from imutool.bias.networks.network import BiasNetwork, LastLayer, Segment
 from imutool.bias.networks.ode import HermitePath, solve
 from imutool.bias.networks.paper_ode import BiasOde
 from imutool.bias.networks.perceptron import Drift, asinh, by_rows
@@ -42,13 +42,23 @@ class Curve(nn.Module):
             nn.init.normal_(layer.weight, 0.0, layer.in_features**-0.5)
         nn.init.zeros_(layers[2].weight)
         self.net = nn.Sequential(layers[0], nn.GELU(), layers[1], nn.Tanh(), layers[2])
+        self.requires_grad_(False)  # the layers below stay as drawn, W and the last one are solved for in closed form
 
     def forward(self, u: Float[Tensor, "*batch 3"], slow: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Motion-dependent bias: `u` the samples, `slow` the filtered ones."""
-        x, s = u.to(self.precision) / self.scale, slow.to(self.precision) / self.scale
-        inputs = torch.cat([x, asinh(NEAR_ZERO * torch.cat([x, s], dim=-1))], dim=-1)
+        inputs = self._inputs(u, slow, self.precision)
         bend = by_rows(self.net, inputs) - by_rows(self.net, inputs.new_zeros(9))
         return u @ self.W.mT + self.curve * bend.to(u)
+
+    def hidden(self, u: Float[Tensor, "*batch 3"], slow: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch width"]:
+        """Inputs of the last layer, zero without motion, in the unit of the curve."""
+        below, inputs = self.net[:-1], self._inputs(u, slow, u.dtype)
+        units: Tensor = below(inputs) - below(inputs.new_zeros(9))
+        return self.curve * units
+
+    def _inputs(self, u: Tensor, slow: Tensor, precision: torch.dtype) -> Float[Tensor, "*batch 9"]:
+        x, s = u.to(precision) / self.scale, slow.to(precision) / self.scale
+        return torch.cat([x, asinh(NEAR_ZERO * torch.cat([x, s], dim=-1))], dim=-1)
 
 
 class Network(BiasNetwork):
@@ -104,6 +114,19 @@ class Network(BiasNetwork):
             return u @ curve.W.mT
         motion: Float[Tensor, "batch n 3"] = curve(u, self._filtered(u, SLOW_S))
         return motion
+
+    def last_layer(self, sensor: Sensor) -> LastLayer | None:
+        """Last layer of the curve; the paper's scheme has none."""
+        if self.config.paper:
+            return None
+        curve = _part(self.curve, sensor, Curve)
+        last = _part(curve.net, "4", nn.Linear)
+
+        def inputs(segment: Segment) -> Float[Tensor, "batch n width"]:
+            u, _ = segment.of(sensor)
+            return curve.hidden(u, self._filtered(u, SLOW_S))
+
+        return LastLayer(curve.W, last.weight, inputs)
 
     def rest_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
         """beta at each sample, linear between the steps of the drift; in the paper's scheme the whole bias."""

@@ -33,49 +33,21 @@ ROWS = 1_000  # samples at a time, so that what they need stays in a core's cach
 def by_rows(net: nn.Sequential, x: Float[Tensor, "*batch i"]) -> Float[Tensor, "*batch o"]:
     """Perceptron linear, GELU, linear, tanh, linear without bias; `ROWS` rows at a time.
 
-    It is computed in the precision of `x`. Where `x` are no samples, and need a gradient of their own, it is left to
-    PyTorch, in the precision of the weights.
+    It is computed in the precision of `x`, and gives its weights no gradient. Where `x` are no samples, and need a gradient of
+    their own, it is left to PyTorch, in the precision of the weights.
     """
     first, second, last = (layer for layer in net if isinstance(layer, nn.Linear))
     if x.requires_grad:
         whole: Tensor = net(x.to(first.weight))
         return whole
-    weights = first.weight, first.bias, second.weight, second.bias, last.weight
-    y: Tensor = _ByRows.apply(x.reshape(-1, x.shape[-1]), torch.is_grad_enabled(), *weights)  # type: ignore[no-untyped-call]
+    rows = x.reshape(-1, x.shape[-1])
+    y = rows.new_empty(len(rows), last.out_features)
+    with torch.no_grad():
+        W1, b1, W2, b2, W3 = (w.to(x) for w in (first.weight, first.bias, second.weight, second.bias, last.weight))
+        for some, out in zip(torch.split(rows, ROWS), torch.split(y, ROWS), strict=True):
+            h = nn.functional.gelu(torch.addmm(b1, some, W1.T))
+            torch.mm(_tanh_(torch.addmm(b2, h, W2.T)), W3.T, out=out)
     return y.reshape(*x.shape[:-1], y.shape[-1])
-
-
-class _ByRows(torch.autograd.Function):
-    """`by_rows` of rows."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, keep: bool, *weights: Tensor) -> Tensor:
-        ctx.kept, ctx.weights, ctx.exact = [], [weight.to(x) for weight in weights], weights[0].dtype
-        W1, b1, W2, b2, W3 = ctx.weights
-        y = x.new_empty(len(x), len(W3))
-        for some, out in zip(torch.split(x, ROWS), torch.split(y, ROWS), strict=True):
-            a = torch.addmm(b1, some, W1.T)
-            h = nn.functional.gelu(a)
-            bent = _tanh_(torch.addmm(b2, h, W2.T))
-            torch.mm(bent, W3.T, out=out)
-            if keep:
-                ctx.kept.append((some, a, h, bent))
-        return y
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        by_weights = [torch.zeros_like(weight) for weight in ctx.weights]
-        (_, _, W2, _, W3), (W1_, b1_, W2_, b2_, W3_) = ctx.weights, by_weights
-        for by_y, (some, a, h, bent) in zip(torch.split(grad.contiguous(), ROWS), ctx.kept, strict=True):
-            W3_.addmm_(by_y.T, bent)
-            by_second = tanh_backward(by_y @ W3, bent)
-            W2_.addmm_(by_second.T, h)
-            b2_ += by_second.sum(0)
-            by_first = gelu_backward(by_second @ W2, a)
-            W1_.addmm_(by_first.T, some)
-            b1_ += by_first.sum(0)
-        return None, None, *(by_weight.to(ctx.exact) for by_weight in by_weights)
 
 
 def perceptron(hidden: Sequence[int]) -> nn.Sequential:

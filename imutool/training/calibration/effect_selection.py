@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import msgspec
 import torch
@@ -32,7 +33,7 @@ from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import Load, Signals
 from imutool.training.calibration.log_scatter import widest
-from imutool.training.calibration.normal_equations import Problem, Seen, gain_of, linearise
+from imutool.training.calibration.normal_equations import Problem, Seen, Terms, gain_of, linearise
 from imutool.training.fit import Epoch, note
 from imutool.training.log_signals import effects_turned_alike, loaded_signals, signals_of
 from imutool.training.settings import SensorPrior, TrainSettings
@@ -93,21 +94,22 @@ def calibrate(
     else:
         effects = temperature.forms(sensor, names)
     cut = folded(pool) if part == "train" else pool
-    seen = Seen(cut, sensor, signals_of(pool) if signals is None else signals, gyro, sensors or SensorPrior())
+    signals = signals_of(pool) if signals is None else signals
+    seen, terms = Seen(cut, sensor, gyro), partial(Terms.of, signals=signals, sensors=sensors or SensorPrior(), pool=cut)
     if own_prior is None and len(pool.names) < FOLDS:
         own_prior = widest(sensor, pool.t)
-    every, gains = linearise(seen, effects, part, own_prior), {}
+    every, gains = linearise(seen, terms(effects), part, own_prior), {}
     if names is None:
         gains = effects_beyond_chance(every, effects)
         if not DRIFTS.keys() & gains.keys() and any(effect.name in DRIFTS for effect in effects):
             # the point of linearisation has all candidates: without a drift it is as if there were none to choose
             effects = tuple(effect for effect in effects if effect.name not in DRIFTS)
-            every = linearise(seen, effects, part, own_prior)
+            every = linearise(seen, terms(effects), part, own_prior)
             gains = effects_beyond_chance(every, effects)
     forms, problem = effects, every
     if names is None and len(gains) < len(effects):
         effects = tuple(effect for effect in effects if effect.name in gains)
-        problem = linearise(seen, effects, part, every.own_prior)
+        problem = linearise(seen, terms(effects), part, every.own_prior)
     theta, covariance = problem.solve_by_scatter(range(len(problem.theta)))
     own = problem.own_at(theta)
     return Calibration(

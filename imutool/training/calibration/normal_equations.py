@@ -126,12 +126,13 @@ class Problem:
         own: Tensor = self.own - torch.linalg.solve(H, g)
         return own
 
-    def predicted(self, columns: Sequence[int], *, by_itself: bool = False) -> Float[Tensor, " logs"]:
+    def predicted(self, columns: Sequence[int], *, by_itself: bool = False, by_scatter: bool = False) -> Float[Tensor, " logs"]:
         """Loss of each log with parameters of the other logs, or `by_itself`; its own are solved for."""
+        of_others = self.solve_by_scatter if by_scatter else self.solve
         p, losses = len(self.prior), []
         held = torch.where(torch.arange(len(self.own_prior)).to(self.prior) < self.free, 0.0, self.own_prior)
         for i, at in enumerate(self.own):
-            theta = self.alone(i).solve(columns).theta if by_itself else self.solve(columns, without=i).theta
+            theta = self.alone(i).solve(columns).theta if by_itself else of_others(columns, without=i).theta
             judged = self.judged.moved(theta - self.theta)
             H, g = judged.H[i, p:, p:] + torch.diag(held), judged.g[i, p:] + held * at
             least = RIDGE * H.diagonal().mean().clamp_min(RIDGE)
@@ -161,15 +162,29 @@ def design_effect(pool: Pool) -> float:
     return 1.0 + SHARED * (len(pool.spans_ns) - 1)
 
 
-@dataclass(frozen=True)
-class Seen:
-    """Samples of one sensor in a pool: signals, gyro under an accelerometer, prior over sensors."""
+class Seen(NamedTuple):
+    """Samples of a sensor in a pool; `gyro` carries the attitude under an accelerometer."""
 
     pool: Pool
     sensor: Sensor
-    signals: Signals
     gyro: Float[Tensor, "n 3"]
-    sensors: SensorPrior
+
+
+class Terms(NamedTuple):
+    """Errors that are linear in parameters theta, the product of `pattern` and the values.
+
+    `prior` is one over the variance of each parameter, about zero.
+    """
+
+    values: Float[Tensor, "n q"]
+    pattern: Float[Tensor, "3 q p"]
+    prior: Float[Tensor, " p"]
+
+    @classmethod
+    def of(cls, effects: Sequence[LinearForm], signals: Signals, sensors: SensorPrior, pool: Pool) -> Terms:
+        """Terms of some effects."""
+        prior = np.concatenate([np.zeros(0), *map(sensors.std_of, effects)]) ** -2.0
+        return cls(*(torch.from_numpy(x).to(pool.t) for x in (terms_of(effects, signals), patterns(effects), prior)))
 
 
 class WindowSet(NamedTuple):
@@ -180,8 +195,8 @@ class WindowSet(NamedTuple):
     judged: bool
 
 
-def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: Float[Tensor, " o"] | None = None) -> Problem:
-    """Gauss-Newton on all effects at once, from the shortest windows to all lengths.
+def linearise(seen: Seen, terms: Terms, part: Part, own_prior: Float[Tensor, " o"] | None = None) -> Problem:
+    """Gauss-Newton on all parameters at once, from the shortest windows to all lengths.
 
     Without `own_prior` nuisances get a prior as wide as the logs scatter, once all lengths are in. Up to then the parameters
     have a weak prior: what it left of a large effect would count as noise, which would keep the prior strong.
@@ -192,20 +207,17 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
     judged_s, lengths_s = JUDGED_FROM_S[seen.sensor], WINDOW_S[seen.sensor]
     found = window_sets(seen.pool, lengths_s, part, MAX_SAMPLES, ends_only=True)
     sets = [WindowSet(*windows, s >= judged_s) for s, windows in zip(lengths_s, found, strict=True) if len(windows[0])]
-    logs = len(seen.pool.names)
-    prior = torch.from_numpy(np.concatenate([np.zeros(0), *map(seen.sensors.std_of, effects)]) ** -2.0).to(seen.pool.t)
+    logs, prior = len(seen.pool.names), terms.prior
     width = widest(seen.sensor, prior) if own_prior is None else own_prior
     theta, own, settled = torch.zeros_like(prior), prior.new_zeros(logs, len(width)), False
-    terms = torch.from_numpy(terms_of(effects, seen.signals)).to(seen.pool.t)
-    pattern = torch.from_numpy(patterns(effects)).to(seen.pool.t)
     pieces, turned = Pieces.between([windows[:2] for windows in sets], PIECE), dict[int, Tensor]()
     samples = seen.pool.of_sensor(seen.sensor)
     rows, unknowns = [pieces.row(windows.first, windows.n) for windows in sets], len(prior) + len(width)
     for step in range(len(sets) + MOST_STEPS):
         fit = judged = Equations(*(prior.new_zeros(logs, *shape) for shape in ((unknowns, unknowns), (unknowns,), ())))
         size = seen.pool.least(seen.sensor)
-        true_u = samples - terms @ torch.einsum("iqp,p->qi", pattern, theta) - own[seen.pool.log, :3]
-        prefix = _prefix(seen, pieces, terms, pattern, true_u, turned)
+        true_u = samples - terms.values @ torch.einsum("iqp,p->qi", terms.pattern, theta) - own[seen.pool.log, :3]
+        prefix = _prefix(seen, pieces, terms, true_u, turned)
         for windows, row in list(zip(sets, rows, strict=True))[: step + 1]:
             equations, size = _equations(seen, windows, prefix.across(*row), true_u, own, size)
             fit = fit + equations
@@ -222,14 +234,7 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
     return problem
 
 
-def _prefix(
-    seen: Seen,
-    pieces: Pieces,
-    terms: Float[Tensor, "n q"],
-    pattern: Float[Tensor, "3 q p"],
-    true_u: Float[Tensor, "n 3"],
-    turned: dict[int, Tensor],
-) -> Prefix:
+def _prefix(seen: Seen, pieces: Pieces, terms: Terms, true_u: Float[Tensor, "n 3"], turned: dict[int, Tensor]) -> Prefix:
     """Turn and sum of pieces: minus the derivative by theta and by the rest bias, and the samples under that derivative.
 
     `turned` keeps the turns under an accelerometer, which stay from step to step.
@@ -243,8 +248,8 @@ def _prefix(
         if seen.sensor == "accel":
             turned[number] = turns
         A = derivative_by_sample(seen.sensor, turns, dt)
-        S = A.flatten(2).mT @ terms[index]
-        by_theta = torch.einsum("mijq,jqp->mip", S.reshape(len(S), 3, 3, S.shape[2]), pattern)
+        S = A.flatten(2).mT @ terms.values[index]
+        by_theta = torch.einsum("mijq,jqp->mip", S.reshape(len(S), 3, 3, S.shape[2]), terms.pattern)
         by_all = torch.einsum("mkij,mkj->mi", A, true_u[index])
         return turns[:, -1], torch.cat([by_theta, A.sum(1), by_all[..., None]], dim=2)
 

@@ -32,11 +32,11 @@ def test_asinh_keeps_its_digits_at_every_size() -> None:
 def test_rows_by_parts_are_the_network() -> None:
     torch.manual_seed(1)
     net = nn.Sequential(nn.Linear(9, 16), nn.GELU(), nn.Linear(16, 16), nn.Tanh(), nn.Linear(16, 3, bias=False)).double()
-    x, weights = random(3, ROWS - 7, 9), list(net.parameters())
+    x = random(3, ROWS - 7, 9)
     by_parts, whole = by_rows(net, x), net(x)
     assert by_parts.shape == whole.shape
     assert close([by_parts], [whole])
-    assert close(gradients(by_parts, weights), gradients(whole, weights))
+    assert not by_parts.requires_grad
 
 
 def test_rows_that_need_a_gradient_get_it() -> None:
