@@ -74,7 +74,7 @@ def test_a_model_is_trained_on_given_logs(tmp_path: Path, example: Example) -> N
         write(flight(seed, duration_s=13.0, rate_hz=100.0), tmp_path / f"{seed}.mcap")
     words = ["steps=2", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]"]
     printed = example("train_on_your_logs.py", "m.safetensors", "1.mcap", "2.mcap", *words)
-    assert "accel    2/2" in printed
+    assert "gyro    2/2" in printed
     assert "nan" not in printed
     assert len(re.findall(r"held-out error", printed)) == 2
     assert (tmp_path / "m.safetensors").is_file()

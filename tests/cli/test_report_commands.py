@@ -111,7 +111,7 @@ def test_a_fleet_leaves_a_page_beside_each_log_and_its_summary_leads_there(task:
     assert done.status == "ok", done.error
     there = tmp_path / "out" / HOSTILE / "log.html"
     assert done.page == f"{HOSTILE}/log.html"
-    assert "linear cuts the orientation error" in done.page_says
+    assert "linear (in the log) cuts the orientation error" in done.page_says
     assert is_current(done, there.with_suffix(".mcap"))
     summary = tmp_path / "pages" / "summary.html"
     summary.parent.mkdir()
@@ -120,7 +120,7 @@ def test_a_fleet_leaves_a_page_beside_each_log_and_its_summary_leads_there(task:
     (link,) = re.findall(r'<a href="([^"]*)"', content)
     assert (summary.parent / unquote(link)).resolve() == there
     assert not set("#?<'") & set(link)
-    assert "linear cuts the orientation error" in content
+    assert "linear (in the log) cuts the orientation error" in content
     there.unlink()
     assert not is_current(done, there.with_suffix(".mcap")), "a page that is gone is made again"
 

@@ -41,7 +41,12 @@ TINY = TrainSettings(
     samples=400,
     steps=6,
     validate_every=2,
-    model={"curve_width": 8, "drift_step_s": 0.1, "loads": []},  # test_drift.py lets the logs choose
+    model={
+        "curve_width": 8,
+        "drift_step_s": 0.1,
+        "drift": ["gyro", "accel"],
+        "loads": [],
+    },  # test_drift.py lets the logs choose
 )
 LINEAR = TrainSettings(gyro_window_s=(0.5, 1.0), accel_window_s=(0.5,))
 
@@ -133,7 +138,7 @@ def test_the_same_command_writes_the_same_bytes(logs: list[Path], expected: byte
     assert (tmp_path / "m.safetensors").read_bytes() == expected
     assert names(tmp_path) == ["m.safetensors"]  # the checkpoint has gone
     assert model.card["name"] == "m"
-    assert [epoch.step for epoch in said] == [0, 2, 4, 6] * 2
+    assert [epoch.step for epoch in said] == [0, 2, 4, 6] * 2  # of both sensors, as both have a drift here
 
 
 def test_a_script_s_settings_of_pytorch_change_no_training_and_stay(logs: list[Path], expected: bytes, tmp_path: Path) -> None:
@@ -302,6 +307,7 @@ def test_a_training_that_diverges_leaves_no_model(logs: list[Path], tmp_path: Pa
 # ── hybrid: effects in closed form, then the neural ODE where it helps ───────────────────────────────────────────────
 
 SMALL_ODE = {"curve_width": 8, "drift_step_s": 0.1}
+DRIFTING_ODE = {**SMALL_ODE, "drift": ["gyro", "accel"]}  # so that both sensors take steps
 HYBRID = TrainSettings(
     gyro_window_s=(0.25, 0.5),
     accel_window_s=(0.25,),
@@ -309,7 +315,7 @@ HYBRID = TrainSettings(
     steps=6,
     validate_every=2,
     compare=False,  # left-out logs are scored in the training on orientations
-    model={"gyro_effects": ["gyro_scale", "gyro_misalignment"], "accel_effects": ["accel_scale"], "ode": SMALL_ODE},
+    model={"gyro_effects": ["gyro_scale", "gyro_misalignment"], "accel_effects": ["accel_scale"], "ode": DRIFTING_ODE},
 )
 
 
