@@ -3,7 +3,8 @@
 A phone or a driver stamps on arrival, often in whole milliseconds, so that several samples have one stamp. The first of n
 samples with a stamp T keeps it, and sample k goes to T + k s with s = (T' - T) / n, where T' is the next stamp. If the steps
 are clearly more even then, all end at T instead, with s from the stamp before: such samples came late. Next to a gap s is
-the median of the steps near it, so that a gap stays one. A sample that is alone with its stamp keeps it.
+the median of the steps near it, so that a gap stays one. A first stamp that had begun before the recording has fewer samples:
+they end at the next one. Any other sample that is alone with its stamp keeps it.
 """
 
 from __future__ import annotations
@@ -87,9 +88,9 @@ def spread_stamps(t_ns: Int64[np.ndarray, " n"], starts: Int64[np.ndarray, " s"]
         return stamps
 
     ahead = placed(np.append(steps, np.inf) / count, behind)
-    if steps[0] <= GAP_STEPS * median(steps):  # no gap: a first stamp with fewer samples had begun before the recording
-        late = int(steps[0] - np.rint(usual[0] * count[0]))
-        ahead[: count[0]] += max(0, late) if steps[0] > GAP_STEPS * usual[0] * count[0] else 0
+    lasting = float(usual[0] * count[0])
+    if GAP_STEPS * lasting < steps[0] <= GAP_STEPS * median(steps):  # fewer samples, and no gap
+        ahead[: count[0]] += int(steps[0] - lasting)
     back = placed(np.append(np.inf, steps) / count, behind - each + 1)
     moved = np.diff(ahead) != np.diff(back)
     of_row = np.repeat(usual, count)[1:][moved]

@@ -160,7 +160,7 @@ class Training:
         return held_out_errors(model, sensor, self.pool, self.tracks.per_log().detach(), self.settings.window_s[sensor][:2])
 
     def _closed_form(self, sensor: Sensor) -> None:
-        """Calibration and rest biases, as far as windows and a matrix show them."""
+        """Calibration, curve and rest biases, as far as windows show them."""
         rest = self.tracks.per_log().detach()
         scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
         lengths = self.settings.window_s[sensor]

@@ -37,6 +37,7 @@ from imutool.inertial.strapdown import along_truth, drift
 from imutool.processes.forked import of_each
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
 from imutool.training.calibration.effect_selection import LINEAR, Calibration, parameter_columns
+from imutool.training.calibration.log_scatter import LEAST_GAIN, SURELY
 from imutool.training.candidates import CANDIDATES, best_predicted, known, left_out_effects, left_out_model, with_statistics
 from imutool.training.log_agreement import Contradiction, check_axes, contradicting
 from imutool.training.log_signals import without_nuisances
@@ -47,7 +48,6 @@ from imutool.units import Sensor
 logger = logging.getLogger(__name__)
 
 STARTS = ("auto", "smooth", "truth")
-LEAST_GAIN, SURELY = 0.03, 2.0  # share of the error, and standard errors, by which a candidate is better than a simpler one
 CHANCE = 0.3  # least deviation of a sum of gains over logs, in logarithms of errors, that candidates without a true effect have
 LEAST_ERROR = 1e-6  # ° or m/s
 LONGEST_S = 120.0  # of a log that is scored

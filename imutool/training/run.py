@@ -30,9 +30,10 @@ from imutool.recording import Recording
 from imutool.training import checkpoint
 from imutool.training.bias_spread import speed_of
 from imutool.training.calibration.effect_selection import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
+from imutool.training.calibration.log_scatter import LEAST_GAIN, SURELY
 from imutool.training.candidates import left_out_covariance, simpler_effects
 from imutool.training.fit import Epoch, Training, check_device, note
-from imutool.training.left_out import LEAST_ERROR, LEAST_GAIN, SURELY, beaten, compare
+from imutool.training.left_out import LEAST_ERROR, beaten, compare
 from imutool.training.log_signals import matrix_covariance, with_poses_of_sensor
 from imutool.training.objectives.paper_scheme import PaperTraining
 from imutool.training.settings import TrainSettings, settings_for

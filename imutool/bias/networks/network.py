@@ -95,7 +95,7 @@ class BiasNetwork(nn.Module, ABC):
         """Part of a sensor's bias that follows from the samples alone, whatever the rest bias. Differentiable."""
 
     def last_layer(self, sensor: Sensor) -> LastLayer | None:
-        """Last layer of the motion bias, where it is solved for in closed form after the descent."""
+        """Last layer of the motion bias, where it is solved for in closed form before the descent."""
         return None
 
     def rest_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:

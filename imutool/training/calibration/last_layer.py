@@ -18,11 +18,11 @@ from torch import Tensor
 from imutool.array_types import Float
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.training.calibration.closed_form import W_PRIOR
+from imutool.training.calibration.log_scatter import LEAST_GAIN, SURELY
 from imutool.training.calibration.normal_equations import TINY, Seen, Terms, linearise
 from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 
-LEAST_GAIN, SURELY = 0.03, 2.0  # share of the judged loss, and standard errors over the logs, by which V has to be better
 WEIGHT_PRIOR = 0.3  # of a weight, in the unit of the curve: chosen by left-out training logs of FETCH
 
 

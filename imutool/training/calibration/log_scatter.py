@@ -25,6 +25,7 @@ NUISANCE_STD = {  # how far they differ from log to log, at most
 ROTATION = {"gyro": slice(3, 6), "accel": slice(5, 8)}  # of a log's unknowns, of which the rest bias comes first
 CLOCK, LEVER = {"gyro": slice(6, 7), "accel": slice(8, 9)}, {"gyro": slice(7, 7), "accel": slice(9, 12)}
 NARROWER = np.geomspace(1.0, 20.0, 13)  # shares of these widths that logs may show, as divisors
+LEAST_GAIN, SURELY = 0.03, 2.0  # share of the error, and standard errors over logs, by which more parameters have to be better
 USUAL_SQUARES, LEAST_VARIANCE = 4.0, 1e-10  # of differences between logs; of a combination of parameters, in units of the prior
 
 
