@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
+import json
 import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from mkdocs.structure.files import File, Files
+
+from imutool.config import Settings
 
 ROOT = Path(__file__).parents[1]
 INTRODUCTION = """# Commands
@@ -23,6 +28,13 @@ What distinguishes a real sensor from an ideal one: `imutool simulate` applies i
 models correct it. Each is one file in `imutool/sensor/effects/`.
 """
 
+SETTINGS = """# Settings
+
+`imutool train`, `diagnose` and `vio` take `--set KEY=VALUE`, more than once. `train` and `diagnose` also take a file with
+the same keys, `--config FILE.toml`. Values are those of TOML; the shell wants quotes around lists:
+`--set 'gyro_window_s=[1, 4, 15]'`. A key that does not exist is refused, and the nearest is named.
+"""
+
 PLACEHOLDERS = {"str": "TEXT", "int": "N", "float": "X", "Path": "PATH", "path": "PATH", "int range": "N"}
 
 
@@ -31,6 +43,7 @@ def on_files(files: Files, config: Any) -> Files:
     for name, text in (
         ("reference/commands.md", commands()),
         ("reference/effects.md", effects()),
+        ("reference/settings.md", "\n".join([SETTINGS, *settings()])),
         *project_files(),
     ):
         files.append(File.generated(config, name, content=text))
@@ -54,6 +67,52 @@ def effects() -> str:
         parameters = f"{len(effect.parameters)} ({', '.join(units)})"
         rows.append(" | ".join(("", f"`{effect.name}`", f"`{effect.equation}`", parameters, effect.observable_if, "")).strip())
     return "\n".join([EFFECTS, *rows, ""])
+
+
+def settings() -> Iterator[str]:
+    """A section for the settings of each command and each method, from their classes."""
+    from imutool import registry
+    from imutool.diagnosis.settings import DiagnoseSettings
+    from imutool.training.settings import TrainSettings
+    from imutool.vio.run import VioSettings
+
+    yield from tables("imutool train", TrainSettings)
+    for method in registry.names("imutool.networks"):
+        preferred = registry.load("imutool.networks", method).Network.prefers
+        own = registry.load("imutool.bias", method).Config
+        if method != "static" and (own.__struct_fields__ or preferred):
+            yield from tables(f"imutool train --method {method}", own)
+            yield "".join(f"- Its default of `{name}` is `{value}`.\n" for name, value in preferred.items())
+    yield from tables("imutool diagnose", DiagnoseSettings)
+    yield from tables("imutool vio", VioSettings)
+
+
+def tables(title: str, kind: type[Any], prefix: str = "") -> Iterator[str]:
+    """A table of a class of settings, and one for each group in it."""
+    yield f"{'###' if prefix else '##'} {title}\n\n{(inspect.getdoc(kind) or '').partition(chr(10))[0]}\n"
+    groups = {}
+    rows = ["| setting | default | meaning |", "|---|---|---|"]
+    for field in msgspec.structs.fields(kind):
+        if isinstance(field.type, type) and issubclass(field.type, Settings):
+            groups[field.name] = field.type
+        else:
+            default = "" if field.default in (None, msgspec.UNSET, msgspec.NODEFAULT) else f"`{toml(field.default)}`"
+            rows.append(f"| `{prefix}{field.name}` | {default} | {cell(meaning_of(kind, field.name))} |")
+    yield "\n".join([*rows, ""]) if len(rows) > 2 else ""
+    for name, group in groups.items():
+        yield from tables(f"`{prefix}{name}`", group, f"{prefix}{name}.")
+
+
+def toml(value: Any) -> str:
+    """A default as it is written in a file of settings."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+def meaning_of(kind: type[Any], name: str) -> str:
+    """The comment beside a setting in the source of its class."""
+    sources = (inspect.getsource(each) for each in kind.__mro__ if name in vars(each).get("__annotations__", {}))
+    found = re.search(rf"^    {name}: .*?  # (.*)$", next(sources), re.MULTILINE)
+    return found[1] if found else ""
 
 
 def commands() -> str:

@@ -45,13 +45,13 @@ class Config(Settings, frozen=True):
     One channel count and one dilation (samples) per layer.
     """
 
-    channels: Channels = (16, 32, 64, 128)
-    dilations: Dilations = (1, 4, 16, 64)
-    kernel: Annotated[int, msgspec.Meta(ge=1, le=16)] = 7
-    dropout: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.1
-    start: Literal["closed_form", "identity"] = "closed_form"  # of C
-    gyro_unit_rad_s: Positive = 0.02
-    accel_unit_m_s2: Positive = 0.2
+    channels: Channels = (16, 32, 64, 128)  # of each layer
+    dilations: Dilations = (1, 4, 16, 64)  # of each layer, in samples
+    kernel: Annotated[int, msgspec.Meta(ge=1, le=16)] = 7  # samples of a convolution
+    dropout: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.1  # share of the outputs that a training step leaves out
+    start: Literal["closed_form", "identity"] = "closed_form"  # of C; the original begins at the identity
+    gyro_unit_rad_s: Positive = 0.02  # unit of the network's output for the gyro
+    accel_unit_m_s2: Positive = 0.2  # the same for the accelerometer
 
     def unit(self, sensor: Sensor) -> float:
         """Unit of a network's output (rad/s or m/s²)."""

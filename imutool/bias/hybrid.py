@@ -34,11 +34,11 @@ class Config(Settings, frozen=True):
     `temperature` is the log's channel that the drifts `gyro_temperature` and `accel_temperature` follow.
     """
 
-    gyro_effects: tuple[str, ...] | None = None
-    accel_effects: tuple[str, ...] | None = None
-    remainder: bool = True
+    gyro_effects: tuple[str, ...] | None = None  # names of effects; without them the training chooses
+    accel_effects: tuple[str, ...] | None = None  # the same for the accelerometer
+    remainder: bool = True  # whether a neural ODE may learn what the effects leave
     ode: neural_ode.Config = neural_ode.Config()
-    temperature: str | msgspec.UnsetType = msgspec.UNSET
+    temperature: str | msgspec.UnsetType = msgspec.UNSET  # channel of the log that drifts with the temperature follow
 
     def effects(self, sensor: Sensor) -> tuple[str, ...] | None:
         """Effects that the settings name for a sensor; None if the training chooses."""

@@ -60,19 +60,19 @@ class Config(Settings, frozen=True):
     """
 
     scheme: Literal["split", "paper"] | msgspec.UnsetType = msgspec.UNSET  # paper: as written there (`networks.paper_ode`)
-    curve_width: Width = 64
-    drift: tuple[Sensor, ...] = ("gyro",)
-    drift_step_s: Positive = 0.25
-    solver: Literal["euler", "rk4", "dopri5"] = "euler"
-    adjoint: bool = False
+    curve_width: Width = 64  # units of each hidden layer of the curve
+    drift: tuple[Sensor, ...] = ("gyro",)  # sensors whose rest bias drifts
+    drift_step_s: Positive = 0.25  # step of the solver
+    solver: Literal["euler", "rk4", "dopri5"] = "euler"  # of the drift's ODE
+    adjoint: bool = False  # whether derivatives come from the adjoint ODE, which needs less memory
     loads: tuple[str, ...] | msgspec.UnsetType = msgspec.UNSET  # drifts of the gyro behind its load; unset: training chooses
     temperature: str | msgspec.UnsetType = msgspec.UNSET  # channel that the load gyro_temperature follows
-    gyro_scale_rad_s: Positive = 0.2
-    gyro_curve_rad_s: Positive = 0.02
-    gyro_drift_rad_s2: Positive = 1e-4
-    accel_scale_m_s2: Positive = 10.0
-    accel_curve_m_s2: Positive = 0.2
-    accel_drift_m_s3: Positive = 1e-3
+    gyro_scale_rad_s: Positive = 0.2  # rate that is 1 at the networks' input
+    gyro_curve_rad_s: Positive = 0.02  # bias that is 1 at the curve's output
+    gyro_drift_rad_s2: Positive = 1e-4  # change of the bias that is 1 at the drift's output
+    accel_scale_m_s2: Positive = 10.0  # the same three of the accelerometer: input
+    accel_curve_m_s2: Positive = 0.2  # curve
+    accel_drift_m_s3: Positive = 1e-3  # drift
 
     @property
     def paper(self) -> bool:

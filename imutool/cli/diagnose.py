@@ -52,7 +52,7 @@ def diagnose(
     metric: Metric = None,
     config: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.toml", help="Settings; imutool.diagnosis.settings.DiagnoseSettings lists them."),
+        typer.Option(metavar="FILE.toml", help="Settings; the documentation lists them (Reference, Settings)."),
     ] = None,
     set_: Set = None,
     imu: Imu = None,

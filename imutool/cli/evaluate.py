@@ -12,7 +12,7 @@ import typer
 from msgspec import convert, field
 
 from imutool.bias_start import Fitness
-from imutool.cli.app import COMMON, Aid, Common, Imu, Init, Logs, Models, ReportPage, Smooth, Truth, Written, app
+from imutool.cli.app import COMMON, Aid, Common, Imu, Init, Logs, Models, ReportPage, Set, Smooth, Truth, Written, app
 from imutool.cli.terminal import figures, say, table
 from imutool.errors import ImutoolError
 from imutool.report import UNSET, Report, Section, UnsetType
@@ -182,10 +182,7 @@ def vio(
     blackout: Annotated[float, typer.Option(metavar="SECONDS", help="Length of a camera blackout in every 15 s.")] = 0.0,
     duration: Annotated[float | None, typer.Option(metavar="SECONDS", help="Use only this much of each log.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of landmarks, tracks and pixel noise.")] = 0,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="key=value", help="Change a setting of imutool.vio.run.VioSettings. Repeatable."),
-    ] = None,
+    set_: Set = None,
     common: Common = COMMON,
 ) -> None:
     """Score a visual-inertial estimate on the log's IMU, raw and with each model.

@@ -31,9 +31,9 @@ class IncrementSettings(Settings, frozen=True):
     See `imutool.training.objectives.increments`.
     """
 
-    gyro_samples: tuple[Count, ...] = (16, 32)
-    accel_samples: tuple[Count, ...] = (16, 32)
-    stretch_s: Positive = 16.0
+    gyro_samples: tuple[Count, ...] = (16, 32)  # lengths of the increments of attitude
+    accel_samples: tuple[Count, ...] = (16, 32)  # the same of velocity
+    stretch_s: Positive = 16.0  # whose increments all count in a step
 
 
 class PaperSettings(Settings, frozen=True):
@@ -44,11 +44,11 @@ class PaperSettings(Settings, frozen=True):
 
     samples: Count = 16  # of a segment
     segments: Count = 1000  # a step
-    gyro_steps: Annotated[int, msgspec.Meta(ge=0)] = 1800
-    accel_steps: Annotated[int, msgspec.Meta(ge=0)] = 1800
+    gyro_steps: Annotated[int, msgspec.Meta(ge=0)] = 1800  # of the gyro's training
+    accel_steps: Annotated[int, msgspec.Meta(ge=0)] = 1800  # of the accelerometer's
     rate: Positive = 5e-3  # learning rate of Adam
     halve_every: Count = 300  # steps
-    weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-6
+    weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-6  # of AdamW
     smoothed_samples: Count = 1  # around a segment's first bias; the released code has 15 for TUM-VI
 
 
@@ -59,10 +59,10 @@ class PoseFloors(Settings, frozen=True):
     of a good GNSS/INS, of the order of 0.1 degrees and 0.014 m/s. Odometry counts as ten times worse. All four are choices.
     """
 
-    estimate_rad: Positive = 1.7e-3
-    estimate_m_s: Positive = 0.014
-    odometry_rad: Positive = 1.7e-2
-    odometry_m_s: Positive = 0.14
+    estimate_rad: Positive = 1.7e-3  # of a window's attitude, where the poses are an estimate
+    estimate_m_s: Positive = 0.014  # of its velocity
+    odometry_rad: Positive = 1.7e-2  # the same, where they are odometry
+    odometry_m_s: Positive = 0.14  # of its velocity, likewise
 
     def of(self, kind: str) -> tuple[float, float]:
         """Least residuals of gyro (rad) and accel (m/s); of a truth and of poses of unknown kind almost none."""
@@ -102,22 +102,22 @@ class TrainSettings(Settings, frozen=True):
     The defaults here are those of linear and neural_ode; `settings_of` has those of any method.
     """
 
-    seed: int = 0
-    gyro_window_s: tuple[Positive, ...] = (1.0, 4.0, 15.0)
-    accel_window_s: tuple[Positive, ...] = (0.5, 2.0)
-    samples: Count = 8_000
-    steps: Count = 300
-    gyro_rate: Positive = 1e-2  # learning rates
-    accel_rate: Positive = 3e-3
-    weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-4
-    track_knot_s: Positive = 20.0
+    seed: int = 0  # of the random numbers: first weights, batches
+    gyro_window_s: tuple[Positive, ...] = (1.0, 4.0, 15.0)  # windows between true poses whose end the attitude has to reach
+    accel_window_s: tuple[Positive, ...] = (0.5, 2.0)  # the same for the velocity
+    samples: Count = 8_000  # in a step, of windows from all logs
+    steps: Count = 300  # of the descent of one sensor
+    gyro_rate: Positive = 1e-2  # learning rate of the gyro's descent
+    accel_rate: Positive = 3e-3  # the same for the accelerometer
+    weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-4  # of AdamW
+    track_knot_s: Positive = 20.0  # between knots of each log's own slow bias, which the training estimates beside the weights
     validate_every: Count = 100  # steps between two lines of progress, each with a checkpoint
     compare: bool = True  # linear and hybrid: score left-out logs, and keep the simplest model that is not beaten
     increments: IncrementSettings = IncrementSettings()
     paper: PaperSettings = PaperSettings()
     pose_floors: PoseFloors = PoseFloors()
     sensors: SensorPrior = SensorPrior()
-    model: dict[str, Any] = msgspec.field(default_factory=dict)
+    model: dict[str, Any] = msgspec.field(default_factory=dict)  # settings of the method, below; `model.` may be left out
 
     @property
     def window_s(self) -> dict[Sensor, tuple[float, ...]]:

@@ -41,13 +41,13 @@ Tell = Callable[[int, int, str], None]
 class VioSettings(config.Settings, frozen=True, kw_only=True):
     """Camera, tracks and smoother of one comparison."""
 
-    keyframes_hz: Positive = 4.0
+    keyframes_hz: Positive = 4.0  # rate of the images that are used
     features: Annotated[int, Meta(ge=1)] = 30  # tracks at a keyframe
     pixel_noise: Positive = 1.0  # px, of each coordinate; the smoother knows it
     blackout_s: Annotated[float, Meta(ge=0.0)] = 0.0  # the camera sees nothing this long ...
     blackout_every_s: Positive = 15.0  # ... out of every so many seconds
     duration_s: Positive | None = None  # of the stretch with truth; all of it by default
-    seed: Annotated[int, Meta(ge=0)] = 0
+    seed: Annotated[int, Meta(ge=0)] = 0  # of the landmarks and the noise of pixels
     smoother: SmootherSettings = SmootherSettings()
 
 

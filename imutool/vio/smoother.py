@@ -45,14 +45,14 @@ class SmootherSettings(config.Settings, frozen=True, kw_only=True):
     stay, and GTSAM's Cholesky takes a walk much surer than the start's bias for an indeterminate system).
     """
 
-    lag_s: Positive = 3.0
+    lag_s: Positive = 3.0  # of the past that a new keyframe still corrects
     gyro_noise_density: Positive = 2e-3  # rad/s/sqrt(Hz)
     accel_noise_density: Positive = 2e-2  # m/s²/sqrt(Hz)
     gyro_walk_density: Positive = 1e-4  # rad/s²/sqrt(Hz)
     accel_walk_density: Positive = 3e-3  # m/s³/sqrt(Hz)
-    start_position_std_m: Positive = 1e-3
-    start_attitude_std_rad: Positive = 5e-3
-    start_velocity_std_m_s: Positive = 0.05
+    start_position_std_m: Positive = 1e-3  # of the start, which is the true pose
+    start_attitude_std_rad: Positive = 5e-3  # of its attitude
+    start_velocity_std_m_s: Positive = 0.05  # of its velocity
     start_gyro_bias_std: Positive = 0.1  # rad/s
     start_accel_bias_std: Positive = 0.3  # m/s²
     fastest_m_s: Positive = 50.0  # an estimate that claims more has diverged
