@@ -43,8 +43,7 @@ def paths(data: RunData) -> Picture | None:
     views = [((0, 1), "From above", shown), ((_long_side(_box(data, shown)), 2), "From the side", shown)]
     if models := [trace for trace in far if not trace.is_raw]:
         side = _long_side(_box(data, models))
-        whole = f"Whole path{'s' * (len(models) > 1)} of {run_name(models[0]) if len(models) == 1 else 'the models'}"
-        views += [((0, 1), f"{whole}, from above", models), ((side, 2), f"{whole}, from the side", models)]
+        views += [((0, 1), "Whole path, from above", models), ((side, 2), "Whole path, from the side", models)]
     panels = tuple(
         Panel(
             partial(_draw_paths, data=data, shown=traces, axes_of=axes_of, title=title), HEIGHT_INCH, f"Paths: {title.lower()}"
