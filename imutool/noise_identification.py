@@ -17,7 +17,7 @@ from imutool.bias_start.stretches import without_vectors
 from imutool.config import build
 from imutool.errors import DataError
 from imutool.file_location import Location
-from imutool.inertial.stationary import rest_stretches, white_noise
+from imutool.inertial.stationary import CALM, rest_stretches, white_noise
 from imutool.log_info.unit_conversion import in_si_units
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import longest_recording, read_recordings
@@ -31,8 +31,8 @@ from imutool.units import SENSORS, Sensor
 
 KINDS = ("density", "walk", "instability")  # of each sensor, as `Noise` has them
 SHORT = 2.5  # samples: over longer windows vibration averages out, and no longer bounds the residual from below
-DEPENDENT_TRUTH = 0.25  # of a sample's white noise: an independent truth differs by more
-EXPLAINED = 3.0  # times a sample's white noise: a larger residual comes from the truth or the calibration
+DEPENDENT_TRUTH = 0.2  # of a sample's white noise: an independent truth differs by more
+EXPLAINED = 2.5  # times a sample's white noise: a larger residual comes from the truth or the calibration
 UNKNOWN: list[float | None] = [None] * 3
 WINDOWS_S: Mapping[Sensor, tuple[float, float]] = {"gyro": (1.0, 4.0), "accel": (0.5, 2.0)}  # of the calibration
 
@@ -100,7 +100,7 @@ def identify(
     else:
         remarks.append("in motion: the log has no true poses")
     period_s = recording.imu.period_s
-    samples = {sensor: white_noise(getattr(recording.imu, sensor)) * np.sqrt(period_s) for sensor in SENSORS}
+    samples = {sensor: CALM * white_noise(getattr(recording.imu, sensor)) * np.sqrt(period_s) for sensor in SENSORS}
     at_most = {sensor: allan.density_bound(rest.curves[sensor]) if rest is not None else UNKNOWN for sensor in SENSORS}
     combined = _combine(rest, motion, samples, at_most, period_s, remarks)
     if rest is None and motion is None:
@@ -279,7 +279,7 @@ def rows(identified: IdentifiedNoise) -> list[tuple[str, ...]]:
         if identified.at_rest is not None and None in getattr(identified.noise, name):
             table.append((f"{name} at most", *map(_number, identified.at_most[sensor]), unit, identified.at_rest.how))
         differences = map(_number, identified.samples[sensor])
-        table.append((f"{name} of samples", *differences, unit, "calm second differences; 5/6 of white noise"))
+        table.append((f"{name} of samples", *differences, unit, "second differences while the samples are calm"))
         if motion is not None:
             axes = {f"{sensor}_{kind}": motion.axes(sensor, kind) for kind in ("density", "walk")}
             table += [(f"{n} in motion", *map(_number, v), UNITS[n], motion.how) for n, v in axes.items() if v != UNKNOWN]

@@ -33,6 +33,7 @@ TREND_DEVIATIONS = 4.0  # of the difference of two means; real stops reach 2.1, 
 FLOOR_MARGIN = 2.5  # ratio to the calmest windows of the log
 FLOOR_RANK = 10  # rank of the window that sets the floor: a single stuck window must not
 NOISE_BLOCK, CALMEST = 20, 0.25
+CALM = 1.2  # times `white_noise`, that pure white noise is
 MEANS, LEAST_MEANS = (20, 200), 8  # samples of a mean of noise, and how many means there are at least
 TOLERATED_MEAN = 1.8  # by which they may scatter more than noise is measured, which finds five sixths of it
 KEPT_MEANS = 100  # of windows at rest, for their median

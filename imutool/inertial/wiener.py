@@ -15,7 +15,7 @@ from scipy.stats import beta
 
 from imutool.array_types import Bool, Complex128, Float64
 from imutool.config import Settings
-from imutool.inertial.stationary import nothing_but_noise, white_noise
+from imutool.inertial.stationary import CALM, nothing_but_noise, white_noise
 from imutool.recording import Imu, seconds
 
 MOSTLY = 2.0  # times the noise: less is noise for the most part
@@ -24,7 +24,6 @@ INDEPENDENT = 0.5, 0.65  # of such Hann windows, and of their neighbouring frequ
 CHANCE = 1e-4  # of noise to share more at one frequency
 APART = 2  # times the frequencies of a mean: so far from what is shared, nothing of a motion is left in what is not
 ALMOST_ALL, NO_NOISE = 0.9, 1e-12  # of the frequencies, which a recording shares; of the largest power, as good as none
-CALM = 1.2  # times `white_noise`, that pure white noise is
 STEPS, LEAST_SAMPLES, MOST_S = 4, 100, 0.5  # of a fit of two clocks; a larger difference is none of their rates
 SLOW_HZ = 8.0  # of the rates by which they are compared: a vibration has another delay one period later
 SMOOTH = 3  # times the frequencies of a mean: over which noise is taken to have one density

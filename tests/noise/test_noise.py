@@ -224,6 +224,7 @@ def test_a_log_at_rest_gives_both_densities_and_says_for_how_long(tmp_path: Path
     assert any("no bias walk of the gyro" in remark for remark in found.remarks)
     for sensor, density in (("gyro", DENSITY), ("accel", 2e-3)):  # a bound lies above, and not far
         assert all(density < bound < 1.5 * density for bound in found.at_most[sensor] if bound is not None)
+        assert found.samples[sensor] == pytest.approx((density,) * 3, rel=DENSITY_TOLERANCE)
 
 
 def test_noise_has_the_units_that_are_stated_whatever_those_of_the_samples(tmp_path: Path) -> None:
@@ -270,7 +271,7 @@ def test_motion_gives_the_density_where_nothing_rests(moving: Path) -> None:
     assert found.in_motion is not None
     assert found.noise.gyro_density == pytest.approx((2e-3,) * 3, rel=MOTION_TOLERANCE)
     assert "in motion against /ground_truth/pose" in found.noise.sources["gyro_density"]
-    assert found.samples["gyro"] == pytest.approx([2e-3 * 5 / 6] * 3, rel=0.15)  # as `white_noise` says of itself
+    assert found.samples["gyro"] == pytest.approx([2e-3] * 3, rel=0.05)
 
 
 def test_motion_gives_the_walk_of_the_rest_bias() -> None:
