@@ -5,12 +5,13 @@ The constant bias that explains the drift of the integrated samples.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from imutool.array_types import Bool, Float64
-from imutool.bias.model import Array, BiasModel, Vector6
+from imutool.bias.model import COLUMNS, Array, BiasModel, Vector6
 from imutool.bias_start.initial_bias import (
     LEAST_STD,
     TRACKED_BY,
@@ -40,6 +41,8 @@ BRIDGED_S = 0.5  # longest gap of the poses over which turns are compared
 LOST = 2.5  # median periods, beyond which samples are lost
 MOUNT_STD = 0.05  # rad: plausible rotation of markers that were meant to be straight
 SAME = 100.0  # samples whose poses have the same error
+PARTS, CONTRADICTED = 3, 22.5  # of a start; chi-square of their scatter on three axes, exceeded once in a thousand usual starts
+LEAST_TRUTH_STD = np.array([5e-5] * 3 + [2e-3] * 3)  # rad/s and m/s²: no poses show a bias better
 ITERATIONS = 4
 HUBER_MEDIANS = 1.5  # threshold of an outlier, in medians of the residuals
 
@@ -75,13 +78,21 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     residual = np.concatenate([piece.gyro, piece.accel], axis=1) - model.stream(start.rest)(*relative_samples(piece))
     alone = poses_turn_alone(replace(piece, gyro=residual[:, :3]), truth)
     mount_std = 0.0 if model.card else MOUNT_STD  # a trained model knows it
-    offset = bias_from_truth(t[rows], residual, quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows], mount_std, alone)
-    variance = model.truth_std**2 * (TRUTH_S / length_s) ** 2
+    q, v_w, known = quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows]
+    parts = [np.arange(len(t[rows])), *np.array_split(np.arange(len(t[rows])), PARTS)]
+    offset, *thirds = [
+        bias_from_truth(t[rows][at], residual[at], q[at], v_w[at], known[at], mount_std, alone[at])
+        for at in parts
+        if known[at].sum() > 1
+    ]
+    usual = model.truth_std**2 * (TRUTH_S / length_s) ** 2
+    variance = _variance(usual, thirds)
     if not truth.has_positions:
         offset[3:], variance[3:] = 0.0, NOT_SEEN**2
     start = replace(start, std=supported_std(start.std, start.least, offset, variance + WORLD_TILT_STD**2))
     rest, std = _updated(start, offset, variance)
     late = f", of poses {1e3 * abs(late_s):.0f} ms {'late' if late_s > 0 else 'early'}" if late_s else ""
+    late += ", whose thirds contradict each other" if (variance > usual)[:3].any() else ""
     how = f"truth over {length_s:.1f} s{late}{', weighed against the training runs' if model.card else ''}, {accuracy(std)}"
     if not model.card:
         return InitialBias(rest, std, how)
@@ -89,6 +100,21 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     before = replace(bias_prior(model), mean=mean, std=np.maximum(spread, LEAST_STD), least=None)
     ends_s = seconds(piece.t_ns[-1:], int(recording.imu.t_ns[0]))[0]
     return InitialBias(rest, std, f"{how}, then {TRACKED_BY}", follows=before, hold_s=float(ends_s))
+
+
+def _variance(usual: Vector6, thirds: Sequence[Vector6]) -> Vector6:
+    """Variance of an offset: the usual one, or if those of thirds of the poses contradict it, what these show.
+
+    Poses of a log may be worse than those of the training logs: markers are exchanged, a clock wanders. The usual variance of a
+    third is 9 (errors that last) to 27 times (white ones) as large. Of poses that contradict it, a third of it is believed.
+    """
+    variance = usual.copy()
+    if len(thirds) == PARTS:
+        shown, least = np.var(thirds, axis=0, ddof=1), np.maximum(usual, LEAST_TRUTH_STD**2) + WORLD_TILT_STD**2
+        for axes in COLUMNS.values():
+            if (PARTS - 1) * (shown[axes] / least[axes]).sum() / PARTS**2.5 > CONTRADICTED:
+                variance[axes] = np.maximum(usual[axes], np.maximum(shown[axes], shown[axes].mean()) / PARTS)
+    return variance
 
 
 def poses_turn_alone(imu: Imu, truth: Poses) -> Bool[np.ndarray, " n"]:

@@ -18,7 +18,7 @@ from imutool.bias.model import COLUMNS, Vector6
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.networks.threads import of_each
 from imutool.bias_start.bias_at_rest import rest_differences
-from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
+from imutool.bias_start.bias_from_truth import LEAST_TRUTH_STD, TRUTH_S, bias_from_truth
 from imutool.bias_start.initial_bias import AT_REST_STD, SESSION_GAP_S
 from imutool.bias_start.prior_width import USUAL_WALK
 from imutool.geometry import so3
@@ -35,7 +35,6 @@ USUAL_STD = {"gyro": 5e-4, "accel": 2e-2}  # between logs of one switching-on
 MOST_TAIL, LEAST_FREEDOM = 3.0, 0.1  # variance of Student's t: three degrees of freedom, or fewer, count as three
 SESSION_STEP = {"gyro": 3e-3, "accel": 0.3}  # another switching-on: a larger step of the bias from one log to the next
 LEAST_TRUSTED, FEWEST_STARTS = 0.5, 4
-FLOOR_STD = {"gyro": 5e-5, "accel": 2e-3}
 VEHICLE_M2_S = 1.0  # density of velocity above which the filter's usual bound is not believed
 SPEED_WINDOWS_S = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 WALKS, WALK_FACTOR = np.geomspace(0.01, 30.0, 24), 3.0  # multiples of the usual walk; deviation of the prior, as a factor
@@ -288,10 +287,9 @@ def _start_spread(model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"])
     unknown = torch.tensor([TURN_ON_STD["gyro"]] * 3 + [TURN_ON_STD["accel"]] * 3).to(rest)
     if len(off) < FEWEST_STARTS:
         return unknown
-    floor = torch.tensor([FLOOR_STD["gyro"]] * 3 + [FLOOR_STD["accel"]] * 3)
-    spread = MAD_TO_STD * np.median(np.abs(off), axis=0)
+    spread = np.maximum(MAD_TO_STD * np.median(np.abs(off), axis=0), LEAST_TRUTH_STD)
     shown = torch.tensor([sensor in pool.sensors for sensor in SENSORS]).repeat_interleave(3).to(rest.device)
-    return torch.where(shown, torch.maximum(torch.from_numpy(spread), floor).to(rest), unknown)
+    return torch.where(shown, torch.from_numpy(spread).to(rest), unknown)
 
 
 def _samples(pool: Pool) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -78,7 +78,7 @@ def test_the_rest_of_a_log_is_corrected_as_well_as_its_beginning(tmp_path: Path)
         assert found["aoe_deg"] < 8.0, options
     warm, cold = (imutool.debias(recording, m, init="truth").bias[:, :3] for m in (model, switched_on_before(model, 0.0)))
     drift = np.abs(model.tensors["theta_gyro"]).max()
-    assert np.ptp(cold, axis=0).max() > 0.9 * drift
+    assert np.ptp(cold, axis=0).max() > 0.8 * drift
     assert np.ptp(warm, axis=0).max() < 0.3 * drift
 
     imutool.debias(tmp_path / "late.mcap", tmp_path / "clean.mcap", model=tmp_path / "warming.safetensors")

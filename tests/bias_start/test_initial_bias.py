@@ -255,6 +255,24 @@ def test_poses_that_jump_and_are_back_at_once_are_no_bias(biased: Recording) -> 
     np.testing.assert_allclose(start.rest[:3], right.rest[:3], atol=3e-4)
 
 
+def test_poses_whose_parts_disagree_are_trusted_less(biased: Recording) -> None:
+    """The world of the poses leans to and fro by six degrees, slowly."""
+    t = seconds(biased.truth.t_ns, int(biased.imu.t_ns[0]))
+    lean = np.radians(6.0) * np.sin(2.0 * np.pi * t / 8.0)[:, None] * [1.0, 0.0, 0.0]
+    leaning = (Rotation.from_rotvec(lean) * Rotation.from_quat(biased.truth.q_wb_wxyz, scalar_first=True)).as_quat(
+        scalar_first=True
+    )
+    worse = replace(biased.truth, q_wb_wxyz=np.ascontiguousarray(leaning))
+    usual = model(mean=0.0, prior_std=0.03, truth_std=1e-3)
+    sound, doubted = (from_truth(usual, replace(biased, truths={"/truth": truth})) for truth in (biased.truth, worse))
+    assert sound.std[:3].max() < 1.3e-3  # 12 s instead of 15
+    off = np.abs(doubted.rest[:3] - GYRO_BIAS)
+    assert off.max() > 3.0 * sound.std[:3].max()  # what was stated before
+    assert (off < 3.0 * doubted.std[:3]).all()
+    assert "thirds contradict each other" in doubted.how
+    assert "contradict" not in sound.how
+
+
 SPOILED = {
     "late": ("late|explain", lambda poses: replace(poses, t_ns=poses.t_ns + 300_000_000)),
     "frozen": ("explain 0%", lambda poses: replace(poses, q_wb_wxyz=np.repeat(poses.q_wb_wxyz[:1], len(poses), axis=0))),
