@@ -78,11 +78,10 @@ def settings() -> Iterator[str]:
 
     yield from tables("imutool train", TrainSettings)
     for method in registry.names("imutool.networks"):
-        preferred = registry.load("imutool.networks", method).Network.prefers
-        own = registry.load("imutool.bias", method).Config
-        if method != "static" and (own.__struct_fields__ or preferred):
-            yield from tables(f"imutool train --method {method}", own)
-            yield "".join(f"- Its default of `{name}` is `{value}`.\n" for name, value in preferred.items())
+        network = registry.load("imutool.networks", method).Network
+        if network.iterative:
+            yield from tables(f"imutool train --method {method}", registry.load("imutool.bias", method).Config)
+            yield "".join(f"- Its default of `{name}` is `{value}`.\n" for name, value in network.prefers.items())
     yield from tables("imutool diagnose", DiagnoseSettings)
     yield from tables("imutool vio", VioSettings)
 
@@ -169,7 +168,7 @@ def help_of(parameter: Any) -> str:
     """Help text, and the default where there is one that says something."""
     text = text_of(getattr(parameter, "help", "") or "")
     default = parameter.default
-    if parameter.required or isinstance(default, bool) or not isinstance(default, str | int | float | Path):
+    if parameter.required or default == "" or isinstance(default, bool) or not isinstance(default, str | int | float | Path):
         return text
     return f"{text} Default: `{getattr(default, 'value', default)}`."
 
