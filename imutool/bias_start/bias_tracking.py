@@ -177,7 +177,7 @@ def _step(x: State, block: _Block, resting: bool, walk: Float64[np.ndarray, " _"
 
 
 def filter_together(filters: Sequence[BiasFilter], samples: Sequence[Samples]) -> list[list[FilteredBlock]]:
-    """Filtered blocks of filters of equal walk and settings, each of its own samples, from their first on.
+    """Filtered blocks of new filters of equal walk and settings, each of its own samples.
 
     The samples have the same times. Where all filters move, or all rest, numpy takes half as long as for one after the other.
     """
