@@ -18,7 +18,7 @@ from imutool.cleaning import UntrustedError
 from imutool.errors import LOST, ConfigError, ImutoolError, LogError, ModelError
 from imutool.file_location import Location, exists, identity, is_file, to_location
 from imutool.fleet.sources import simulation
-from imutool.fleet.targets import is_current, page_name, partial_files, remove_files, within
+from imutool.fleet.targets import digest, is_current, page_name, partial_files, remove_files, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.mcap_io.codec.joined_imu import parse_parts
 from imutool.mcap_io.log import Log
@@ -70,9 +70,7 @@ def work(task: Task, model: bytes | None = None) -> Result:
         _clear(task, job.target)
         entries = COMMANDS[task.settings.command](job)
         _refuse_changed(task, job.source, job.target)
-        result = msgspec.structs.replace(
-            result, **entries, target_bytes=identity(job.target)[0], target_sha256=sha256(job.target)
-        )
+        result = msgspec.structs.replace(result, **entries, target_bytes=identity(job.target)[0], **digest(job.target))
     except UntrustedError as error:
         result = msgspec.structs.replace(result, status="quarantined", error=str(error), exit_code=error.exit_code)
     except ImutoolError as error:
