@@ -27,7 +27,6 @@ BLOCK_S = 0.5
 RATE_S = 0.1  # at the end of a block, over which the rate is a mean
 CHUNK_S, LOOK_AHEAD_S = 600.0, 600.0  # of smoothing: a bias ten minutes later says nothing about the present one
 
-
 Samples = tuple[Float64[np.ndarray, " _"], Float64[np.ndarray, "_ 3"], Float64[np.ndarray, "_ 3"]]  # logs differ in length
 
 
@@ -157,42 +156,45 @@ class BiasFilter:
         elif block.longest_s > GAP_S:
             most = np.maximum(self._prior.std**2, np.diag(x.covariance(False)))
             step = inertial_filter.reset_pose(x, u[-1, 3:], T, self._prior.walk, most, s)
-        elif rests:
-            resting = u[:-1]
-            variance = resting[:, :3].var(axis=0) / len(resting)
-            step = inertial_filter.rest_step(x, resting.mean(axis=0), variance, T, self._walk, s)
         else:
-            step = _motion_step(x, block, self._walk, s)
+            step = _step(x, block, rests, self._walk, s)
         if self._aiding is not None:
             step = step._replace(after=self._aiding.measure(step.after, float(t[-1])))
         self.state = step.after
         return FilteredBlock(float(t[0]), float(t[-1]), rests, step)
 
 
-def _motion_step(x: State, block: _Block, walk: Float64[np.ndarray, " _"], s: FilterSettings) -> Step:
-    gyro, accel = block.u[..., :3] - x.bias[..., :3], block.u[..., 3:] - x.bias[..., 3:]
-    last = gyro[block.t_s.searchsorted(block.t_s[-1] - RATE_S) :]
+def _step(x: State, block: _Block, resting: bool, walk: Float64[np.ndarray, " _"], s: FilterSettings) -> Step:
+    """Filter step over a block, of one filter or of several at once."""
+    t_s, u = block.t_s, block.u
+    if resting:
+        variance = u[:-1, ..., :3].var(axis=0) / (len(u) - 1)
+        return inertial_filter.rest_step(x, u[:-1].mean(axis=0), variance, float(t_s[-1] - t_s[0]), walk, s)
+    gyro, accel = u[..., :3] - x.bias[..., :3], u[..., 3:] - x.bias[..., 3:]
+    last = gyro[t_s.searchsorted(t_s[-1] - RATE_S) :]
     rate = last.sum(axis=0) / len(last)
-    return inertial_filter.motion_step(x, integrate(block.t_s, gyro, accel), rate, block.missing_s, walk, s)
+    return inertial_filter.motion_step(x, integrate(t_s, gyro, accel), rate, block.missing_s, walk, s)
 
 
 def filter_together(filters: Sequence[BiasFilter], samples: Sequence[Samples]) -> list[list[FilteredBlock]]:
-    """Filtered blocks of filters of equal walk and settings, each of its own samples.
+    """Filtered blocks of new filters of equal walk and settings, each of its own samples.
 
-    The samples have the same times. Where all filters move, numpy takes half as long as for one after the other.
+    The samples have the same times. Where all filters move, or all rest, numpy takes half as long as for one after the other.
     """
-    ready = [[*each._ready(of), *each._waiting] for each, of in zip(filters, samples, strict=True)]
+    own = {id(of): (each, of) for each, of in zip(filters, samples, strict=True)}  # several may have the same samples
+    ready = {key: [*each._ready(of), *each._waiting] for key, (each, of) in own.items()}
     out: list[list[FilteredBlock]] = [[] for _ in filters]
-    for blocks in zip(*ready, strict=True):
+    for blocks in zip(*(ready[id(of)] for of in samples), strict=True):
         first, states = blocks[0][0], [each.state for each in filters if each.state is not None]
-        rest = any(rests and each._rests(block) for each, (block, rests) in zip(filters, blocks, strict=True))
-        if rest or len(states) < len(filters) or first.longest_s > GAP_S:
+        rest = {rests and each._rests(block) for each, (block, rests) in zip(filters, blocks, strict=True)}
+        if len(rest) > 1 or len(states) < len(filters) or first.longest_s > GAP_S:
             found = [each._pass(*block) for each, block in zip(filters, blocks, strict=True)]
         else:
-            x = State(*map(np.stack, zip(*(vars(state).values() for state in states), strict=True)))
+            x = State(*map(np.array, zip(*(vars(state).values() for state in states), strict=True)))
             together = first._replace(u=np.stack([block.u for block, _ in blocks], axis=1))
-            step, t_s = _motion_step(x, together, filters[0]._walk, filters[0].settings), first.t_s
-            found = [FilteredBlock(float(t_s[0]), float(t_s[-1]), False, step.of(k)) for k in range(len(filters))]
+            resting, t_s = rest.pop(), first.t_s
+            step = _step(x, together, resting, filters[0]._walk, filters[0].settings)
+            found = [FilteredBlock(float(t_s[0]), float(t_s[-1]), resting, step.of(k)) for k in range(len(filters))]
         for each, so_far, block in zip(filters, out, found, strict=True):
             each.state = block.step.after
             so_far.append(block)
@@ -208,9 +210,7 @@ def stops_of(blocks: Sequence[FilteredBlock]) -> tuple[tuple[float, float], ...]
 class TrackedBiasStream:
     """Bias stream with a causally tracked rest bias.
 
-    Row k depends on samples up to k, and on the start.
-
-    Until `hold_s` the rest bias is that of `held`, which was measured up to then.
+    Row k depends on samples up to k, and on the start. Until `hold_s` the rest bias is that of `held`, measured up to then.
     """
 
     def __init__(self, model: BiasModel, prior: BiasPrior, held: BiasTrajectory, hold_s: float) -> None:

@@ -91,7 +91,7 @@ def _log(folder: Path, row: Mapping[str, Any]) -> FleetLog:
     diagnosis = target if row["effects"] is not None and written else None
     place = str(target) if is_log else row["source"]
     name = str(Path(row["target"]).with_suffix("").as_posix())
-    return FleetLog(name, place, f"{row['target_sha256']}{row['key']}", diagnosis, _facts(row))
+    return FleetLog(name, place, f"{row['target_sha256'] or row.get('target_digest')}{row['key']}", diagnosis, _facts(row))
 
 
 def _facts(row: Mapping[str, Any]) -> dict[str, float | str]:

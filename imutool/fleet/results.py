@@ -22,7 +22,15 @@ NAME = "fleet.parquet"
 ROWS = 4096  # in a group; of a million logs no more are held
 SCHEMA = "imutool.fleet-results/1"
 MOST_ROWS = 500  # in a table: more is for the Parquet file
-MAY_LACK = ("target", "error", "target_sha256", "robot", "peak_bytes", "host")  # columns that are null where they are empty
+MAY_LACK = (
+    "target",
+    "error",
+    "target_sha256",
+    "target_digest",
+    "robot",
+    "peak_bytes",
+    "host",
+)  # columns that are null where they are empty
 TROUBLE = ("failed", "quarantined", "lost")
 
 
@@ -113,6 +121,7 @@ def _schema(pa: Any) -> Any:
         "source_bytes": whole,
         "target_bytes": whole,
         "target_sha256": text,
+        "target_digest": text,  # of a log above 64 MiB, in place of it
         "messages": whole,
         "duration_s": real,
         "biases": pa.list_(pa.struct([("topic", text), ("gyro_rad_s", three), ("accel_m_s2", three)])),

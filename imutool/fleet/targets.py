@@ -11,6 +11,7 @@ from imutool.errors import ConfigError, ImutoolError
 from imutool.file_location import WEB, Location, identity, io_errors, is_file, reason
 from imutool.fleet.task import Result
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.passthrough import source_digest
 from imutool.mcap_io.storage.source import sha256
 
 LONGEST = 200  # bytes of one part of a name: room for what is written beside it under another, within the usual 255
@@ -74,19 +75,37 @@ def without_suffix(log: str) -> str:
     return log[: -len(".mcap")] if log.lower().endswith(".mcap") else log
 
 
+def digest(target: Location) -> dict[str, str]:
+    """Name and digest of a target: SHA-256, or for a large log `digest_with_crcs`.
+
+    SHA-256 of all bytes would take a fifth of the time of a fleet of large logs.
+    """
+    if not _is_log(target) or not isinstance(target, Path) or target.stat().st_size <= source_digest.LARGEST_HASHED:
+        return {"target_sha256": sha256(target)}  # in a store each chunk's head would be a request
+    with Log(target) as log, log.named():
+        return {"target_digest": source_digest.digest_with_crcs(log.index)}
+
+
+def _is_log(target: Location) -> bool:
+    return target.suffix.lower() == ".mcap"
+
+
 def is_current(done: Result, target: Location, *, whole: bool = False) -> bool:
     """Whether a target still has its recorded size and opens as a log.
 
-    With `whole`, whether its SHA-256 is unchanged.
+    With `whole`, whether its digest is unchanged, and every CRC for which that stands.
     """
     if done.status == "quarantined":  # nothing was written
         return True
     try:
         if identity(target)[0] != done.target_bytes or (done.page and not is_file(target.with_name(page_name(target.name)))):
             return False
-        if whole or target.suffix.lower() != ".mcap":
+        if done.target_sha256 and (whole or not _is_log(target)):
             return sha256(target) == done.target_sha256
-        with Log(target):
+        with Log(target) as log, log.named():
+            if whole:
+                log.index.check()
+                return source_digest.digest_with_crcs(log.index) == done.target_digest
             return True
     except ImutoolError:
         return False

@@ -126,6 +126,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, tag_field="line", tag="d
     source_bytes: int = 0
     target_bytes: int = 0
     target_sha256: str = ""
+    target_digest: str = ""  # of a large log, in place of it: `source_digest.digest_with_crcs`
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     messages: int | None = None  # a diagnosis does not count them

@@ -43,7 +43,7 @@ TURN, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 POSE, BIAS, GROUND, STEADY = slice(0, 9), slice(9, 15), slice(15, 21), slice(21, 27)
 SIZE = 27
 G_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
-HAT_G = hat(G_W)
+HAT_G, ONES = hat(G_W), np.ones(3)
 STOPPED = np.zeros((3, SIZE))  # rows of d(velocity)/d(error)
 STOPPED[:, VELOCITY] = np.eye(3)
 STILL = np.zeros((3, SIZE))  # rows of d(gyro bias at rest)/d(error)
@@ -178,23 +178,23 @@ def motion_step(x: State, motion: Increment, rate: Vector3, missing_s: float, wa
     return _with_velocity(step, H, step.expected.v_w + matvec(steady, x.steady), noise, HUBER)
 
 
-def _with_velocity(step: Step, H: Float64[np.ndarray, "*filters 3 m"], v: Vector3, noise: float, most: float) -> Step:
+def _with_velocity(step: Step, H: Float64[np.ndarray, "... 3 m"], v: Vector3, noise: float, most: float) -> Step:
     """Step after a velocity that is zero but for `noise` per axis; with less weight above `most` standard deviations."""
     S = H @ step.expected.P[..., :SIZE, :SIZE] @ H.swapaxes(-1, -2) + noise * EYE
-    size = np.sqrt((v[..., None, :] @ v[..., None])[..., 0, 0] / np.einsum("...ii->...", S))
-    after = update(step.expected, H, v, noise * np.maximum(1.0, size / most)[..., None] ** 2 * np.ones(3))
+    size = np.sqrt(np.einsum("...i,...i->...", v, v) / np.einsum("...ii->...", S))
+    after = update(step.expected, H, v, noise * np.maximum(1.0, size / most)[..., None] ** 2 * ONES)
     return step._replace(after=after, innovation=(v, S))
 
 
-def rest_step(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, walk: Walk, s: FilterSettings) -> Step:
+def rest_step(x: State, mean: Vector6, variance: Vector3, T: float, walk: Walk, s: FilterSettings) -> Step:
     """Filter step over a block at rest, from the mean and the variance of the gyro's mean."""
-    dv = (mean[3:] - x.bias[3:] - x.ground[3:]) * T
-    by_bias = np.zeros((9, 6))
-    by_bias[3:6, 3:], by_bias[6:, 3:] = -T * np.eye(3), -0.5 * T**2 * np.eye(3)
+    dv = (mean[..., 3:] - x.bias[..., 3:] - x.ground[..., 3:]) * T
+    by_bias = np.zeros((*dv.shape[:-1], 9, 6))
+    by_bias[..., VELOCITY, 3:], by_bias[..., POSITION, 3:] = -T * EYE, -0.5 * T**2 * EYE
     push = s.accel_density**2 * T
     step = _predict(x, x.R_wb, dv, 0.5 * T * dv, by_bias, T, (LEAST_VARIANCE, push), walk, resting=True)
     step = _with_velocity(step, STOPPED, step.expected.v_w, s.rest_m_s**2, math.inf)
-    rate = step.after.rest_bias(True)[:3] - mean[:3]
+    rate = step.after.rest_bias(True)[..., :3] - mean[..., :3]
     return step._replace(after=update(step.after, STILL, rate, variance + s.rest_rad_s**2))
 
 
@@ -215,9 +215,8 @@ def _predict(
     p = x.p_wb + x.v_w * T + 0.5 * T**2 * G_W + matvec(x.R_wb, dp)
     by_bias_w = x.R_wb[..., None, :, :] @ by_bias.reshape(*by_bias.shape[:-2], 3, 3, 6)
     by_bias_w[..., 0, :, :] = of_turn = R @ by_bias[..., :3, :]
-    V, X = hat(v), hat(p)
-    by_bias_w[..., 1, :, :] += V @ of_turn
-    by_bias_w[..., 2, :, :] += X @ of_turn
+    hats = hat(np.concatenate([v, p], axis=-1).reshape(*v.shape[:-1], 2, 3))
+    by_bias_w[..., 1:, :, :] += hats @ of_turn[..., None, :, :]
     F = np.zeros(x.P.shape) + np.eye(x.P.shape[-1])
     F[..., VELOCITY, TURN], F[..., POSITION, TURN], F[..., POSITION, VELOCITY] = T * HAT_G, 0.5 * T**2 * HAT_G, T * EYE
     F[..., POSE, BIAS] = by_bias_w.reshape(by_bias.shape)
@@ -225,7 +224,7 @@ def _predict(
         F[..., POSE, GROUND] = F[..., POSE, BIAS]
     P = F @ x.P @ F.swapaxes(-1, -2)
     by_noise, of_noise = np.zeros(by_bias.shape), np.empty(x.bias.shape)  # of the turn, then of the push
-    by_noise[..., TURN, :3], by_noise[..., VELOCITY, :3], by_noise[..., POSITION, :3] = EYE, V, X
+    by_noise[..., TURN, :3], by_noise[..., 3:, :3] = EYE, hats.reshape(*v.shape[:-1], 6, 3)
     by_noise[..., VELOCITY, 3:], by_noise[..., POSITION, 3:] = EYE, 0.5 * T * EYE
     of_noise[..., :3], of_noise[..., 3:] = np.asarray(noise[0])[..., None], noise[1]
     P[..., POSE, POSE] += (by_noise * of_noise[..., None, :]) @ by_noise.swapaxes(-1, -2)
@@ -234,11 +233,11 @@ def _predict(
     variances[..., BIAS] += walked[:6]
     if len(walked) > 6:
         variances[..., SIZE:] += walked[6:]
-    expected = State(R, v, p, x.bias, x.ground, x.steady, 0.5 * (P + P.swapaxes(-1, -2)), x.offsets)
+    expected = State(R, v, p, x.bias, x.ground, x.steady, P, x.offsets)
     return Step(x, expected, F, expected)
 
 
-def update(x: State, H: Float64[np.ndarray, "*filters k m"], z: Error, noise: Error) -> State:
+def update(x: State, H: Float64[np.ndarray, "... k m"], z: Error, noise: Error) -> State:
     """Kalman update by z = H e + n.
 
     With e the first m errors of the estimate and `noise` the variances of n.

@@ -21,7 +21,7 @@ Matrix3 = Float64[np.ndarray, "*filters 3 3"]
 Vectors = Float64[np.ndarray, "n *filters 3"]
 EYE = np.eye(3)
 HATS = np.cross(EYE[:, None], EYE[None]).swapaxes(1, 2).reshape(3, 9)  # hat(x), row by row, is x @ HATS: one product
-AFTER, BEFORE = (1, 2, 0), (2, 0, 1)  # axes of a cross product
+CROSS = -HATS  # from all products of two vectors' axes to their cross product: eps_iab x_ab
 SMALL_RAD2 = 1e-8  # below, two terms of the series are exact to 1e-17
 LEAST_RAD2 = 1e-300  # added to a square, so that sin(x) / x is 1 at zero
 
@@ -56,31 +56,46 @@ def exp(xi: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"
 
     cos I + sin/angle hat(xi) + (1 - cos)/angle² xi xi^T.
     """
-    half = 0.5 * np.sqrt(np.einsum("...i,...i->...", xi, xi) + LEAST_RAD2)[..., None]
+    return _rotation(xi, _length(xi))
+
+
+def _length(xi: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch"]:
+    return np.asarray(np.sqrt(np.einsum("...i,...i->...", xi, xi) + LEAST_RAD2))
+
+
+def _rotation(xi: Float64[np.ndarray, "*batch 3"], angle: Float64[np.ndarray, "*batch"]) -> Float64[np.ndarray, "*batch 3 3"]:
+    half = 0.5 * angle[..., None]
     sine = np.sin(half)
-    first, second = sine / half * np.cos(half), 0.5 * (sine / half) ** 2
-    R: Float64[np.ndarray, "*batch 3 3"] = (second * xi)[..., None] * xi[..., None, :]
-    R += hat(first * xi)
+    sinc = sine / half
+    R: Float64[np.ndarray, "*batch 3 3"] = (0.5 * sinc**2 * xi)[..., None] * xi[..., None, :]
+    R += hat(sinc * np.cos(half) * xi)
     R.reshape(*xi.shape[:-1], 9)[..., ::4] += 1.0 - 2.0 * sine**2
     return R
 
 
 def exp_and_jacobian(xi: Vector3) -> tuple[Matrix3, Matrix3]:
     """Rotation by a rotation vector, and its left Jacobian; in floats, which are faster."""
-    if xi.ndim > 1:
-        E, J = zip(*map(exp_and_jacobian, xi), strict=True)
-        return np.array(E), np.array(J)
-    x, y, z = xi.tolist()
+    both = np.array([_exp_and_jacobian(*x) for x in xi.reshape(-1, 3).tolist()]).reshape(*xi.shape[:-1], 2, 3, 3)
+    return both[..., 0, :, :], both[..., 1, :, :]
+
+
+def _exp_and_jacobian(x: float, y: float, z: float) -> tuple[float, ...]:
+    """Entries of I + a [xi]x + b [xi]x² and I + b [xi]x + c [xi]x², row by row."""
     square = x * x + y * y + z * z
     if square < SMALL_RAD2:
-        sine, first, second = 1.0 - square / 6.0, 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+        a, b, c = 1.0 - square / 6.0, 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
     else:
         angle = math.sqrt(square)
-        sine, first = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
-        second = (1.0 - sine) / square
-    X = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    X2 = X.dot(X)
-    return EYE + sine * X + first * X2, EYE + first * X + second * X2
+        a, b = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+        c = (1.0 - a) / square
+    return _polynomial(x, y, z, a, b) + _polynomial(x, y, z, b, c)
+
+
+def _polynomial(x: float, y: float, z: float, a: float, b: float) -> tuple[float, ...]:
+    """Entries of I + a [xi]x + b [xi]x², row by row."""
+    xx, yy, zz, xy, xz, yz = b * x * x, b * y * y, b * z * z, b * x * y, b * x * z, b * y * z
+    x, y, z = a * x, a * y, a * z
+    return 1.0 - yy - zz, xy - z, xz + y, xy + z, 1.0 - xx - zz, yz - x, xz - y, yz + x, 1.0 - xx - yy
 
 
 def log(R: Matrix3) -> Vector3:
@@ -100,17 +115,19 @@ def integrate(t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> 
     n, dt = len(t_s), t_s[1:] - t_s[:-1]
     each = dt.reshape(-1, *(1 for _ in gyro.shape[1:]))
     step = (gyro[:-1] + gyro[1:]) * (0.5 * each)
+    angle = _length(step)
     R, turned = np.empty((*gyro.shape, 3)), np.zeros((*gyro.shape, 3))  # R: body at each sample to body at the first
-    R[0], R[1:] = EYE, _running_product(exp(step))
+    R[0], R[1:] = EYE, _running_product(_rotation(step, angle))
     # a constant c added to the bias turns step k by -Jr c dt, transformed by the later steps
     right_jacobian = (EYE - 0.5 * hat(step)) * each[..., None]
     np.cumsum(R[1:] @ right_jacobian, axis=0, out=turned[1:])
     force = matvec(R, accel)
 
-    weights = np.zeros((2, n))  # trapezoidal, to velocity and to position
-    weights[0, :-1], weights[1, :-1] = dt, dt * (t_s[-1] - 0.5 * (t_s[:-1] + t_s[1:]))
-    weights[:, 1:] += weights[:, :-1].copy()
-    weights *= 0.5
+    halves, weights = np.empty((2, n - 1)), np.zeros((2, n))  # trapezoidal, to velocity and to position
+    halves[0] = 0.5 * dt
+    halves[1] = halves[0] * (t_s[-1] - 0.5 * (t_s[:-1] + t_s[1:]))
+    weights[:, :-1] = halves
+    weights[:, 1:] += halves
     filters = gyro.shape[1:-1]
     all_turned, all_R, force = (x.swapaxes(0, len(filters)) for x in (turned, R, force))  # the samples behind the filters
     moved = weights @ force
@@ -118,11 +135,10 @@ def integrate(t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> 
     by_bias[..., :3, :3] = -R[-1].swapaxes(-1, -2) @ turned[-1]
     # force turned by -turned: its derivative is hat(force) turned, from the sums of force_a turned_bj
     weighted = (weights[:, None] * force.swapaxes(-1, -2)[..., None, :, :]).reshape(*filters, 6, n)
-    sums = (weighted @ all_turned.reshape(*filters, n, 9)).reshape(*filters, 2, 3, 3, 3)
-    by_bias[..., 3:, :3] = (sums[..., AFTER, BEFORE, :] - sums[..., BEFORE, AFTER, :]).reshape(*filters, 6, 3)
+    sums = (weighted @ all_turned.reshape(*filters, n, 9)).reshape(*filters, 2, 9, 3)
+    by_bias[..., 3:, :3] = (CROSS @ sums).reshape(*filters, 6, 3)
     by_bias[..., 3:, 3:] = -(weights @ all_R.reshape(*filters, n, 9)).reshape(*filters, 6, 3)
-    turned_rad = np.sqrt(np.einsum("...i,...i->...", step, step)).sum(axis=0)
-    return Increment(float(t_s[-1] - t_s[0]), R[-1], moved[..., 0, :], moved[..., 1, :], by_bias, turned_rad)
+    return Increment(float(t_s[-1] - t_s[0]), R[-1], moved[..., 0, :], moved[..., 1, :], by_bias, angle.sum(axis=0))
 
 
 def _running_product(R: Float64[np.ndarray, "n *filters 3 3"]) -> Float64[np.ndarray, "n *filters 3 3"]:

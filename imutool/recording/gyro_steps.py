@@ -5,7 +5,7 @@ A digital gyro counts in steps that its data sheet states. Values that lie on su
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -29,14 +29,32 @@ LEAST_LENGTH = 0.85  # of the mean of the phases, where rounded decimals are a t
 LEAST_SUM = 25.0  # of Rayleigh's statistic on three axes: by chance it is larger 5 times in 10^9
 MOST_OFF, MOST_UNCERTAIN = 0.005, 0.003  # share by which the grid's true step differs, and its standard deviation
 LEAST_NEXT = 0.1  # share of neighbours that are one step apart: else the true step is larger
+ROUNDED = 1e-5  # of a step: rounding moves a value by less
 
 
 def unit_by_steps(rates: Float64[np.ndarray, "n 3"]) -> tuple[str, float] | None:
     """Unit of a gyro whose values are steps of a common sensor, and the step; else None."""
     rates = rates[:: max(1, len(rates) // MOST_ROWS)]
     ordered = [np.sort(axis[np.isfinite(axis)]) for axis in rates.T]
-    found = [(unit, step) for unit, step in STEPS if _counts_in(ordered, step)]
+    likely = _likely(ordered, np.array([step for _, step in STEPS]))
+    found = [(unit, step) for (unit, step), worth in zip(STEPS, likely, strict=True) if worth and _counts_in(ordered, step)]
     return found[0] if len({unit for unit, _ in found}) == 1 else None
+
+
+def _likely(ordered: Sequence[Float64[np.ndarray, " _"]], steps: Float64[np.ndarray, " m"]) -> Iterator[bool]:
+    """Whether enough neighbours may be one step apart, for each step: else `_counts_in`, which rounds, need not look."""
+    away = [np.abs(axis - _middle(axis)) if len(axis) else axis for axis in ordered]
+    reach, apart = (np.concatenate(x) for x in ([np.maximum(d[1:], d[:-1]) for d in away], [np.diff(x) for x in ordered]))
+    nearest = np.argsort(reach)
+    reach, apart = reach[nearest], apart[nearest]
+    most, least = (np.searchsorted(reach, MOST_STEPS * steps * size) for size in (1.0 + ROUNDED, 1.0 - ROUNDED))
+    for step, more, fewer in zip(steps.tolist(), most.tolist(), least.tolist(), strict=True):
+        next_to = int(np.count_nonzero(np.abs(apart[:more] - step) < (0.5 + ROUNDED) * step))
+        yield next_to >= LEAST_NEXT * int(np.count_nonzero(apart[:fewer] > ROUNDED * step))
+
+
+def _middle(ordered: Float64[np.ndarray, " n"]) -> float:
+    return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
 def _counts_in(ordered: Sequence[Float64[np.ndarray, " _"]], step: float) -> bool:
@@ -62,8 +80,7 @@ def _distinct(ordered: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:
     """Different values near the median of ordered ones."""
     if not len(ordered):
         return ordered
-    middle = 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
-    near = ordered[np.abs(ordered - middle) < MOST_STEPS].round(6)
+    near = ordered[np.abs(ordered - _middle(ordered)) < MOST_STEPS].round(6)
     different = np.ones(len(near), bool)
     np.not_equal(near[1:], near[:-1], out=different[1:])
     return np.asarray(near[different])

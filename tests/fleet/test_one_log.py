@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -22,8 +23,10 @@ from imutool.errors import ConfigError, LogError
 from imutool.fleet.one_log import COMMANDS, work
 from imutool.fleet.robots import robot_of, robot_pattern
 from imutool.fleet.sources import find
-from imutool.fleet.targets import page_name, target_name
+from imutool.fleet.targets import is_current, page_name, target_name
 from imutool.fleet.task import Result, Settings, Source, Task, with_model_hash
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.passthrough import source_digest
 from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.write import write
@@ -144,6 +147,26 @@ def test_a_flipped_byte_is_seen_when_all_is_read_again(done: Result, logs: Path,
     target.write_bytes(whole)
     again = work(task(logs / "flight_1.mcap", tmp_path / "out", settings, done=done, recheck=True))
     assert (again.status, sha256(target)) == ("ok", done.target_sha256)
+
+
+def test_every_flipped_byte_of_a_large_log_is_seen_by_its_digest(
+    logs: Path, tmp_path: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(source_digest, "LARGEST_HASHED", 1000)
+    done = work(task(logs / "flight_1.mcap", tmp_path / "out", settings))
+    assert (done.target_sha256, len(done.target_digest)) == ("", 64)
+    again = work(task(logs / "flight_1.mcap", tmp_path / "out", settings, done=done, recheck=True))
+    assert (again.status, again.target_digest) == ("skipped", done.target_digest)
+    target = tmp_path / "out" / "a" / "log.mcap"
+    whole = target.read_bytes()
+    with Log(target) as log:
+        chunks, end = log.index.blocks, log.index.data_end
+    outside = [8, chunks[0].offset - 1, chunks[0].offset + 20, chunks[-1].end - 1, end - 1, end + 10, len(whole) - 9]
+    for place in [*outside, *np.linspace(0, len(whole) - 1, 60, dtype=int).tolist()]:
+        target.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+        assert not is_current(done, target, whole=True), place
+    target.write_bytes(whole)
+    assert is_current(done, target, whole=True)
 
 
 def test_what_a_killed_attempt_left_is_removed(logs: Path, tmp_path: Path) -> None:

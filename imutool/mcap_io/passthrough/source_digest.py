@@ -1,4 +1,4 @@
-"""Digest of a source log: SHA-256 of all its bytes, or of what states its contents."""
+"""Digests of logs: SHA-256 of all bytes, or of what states the contents of a large log."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from imutool.file_location import Location
 from imutool.mcap_io.blocks import HEAD_BYTES
 from imutool.mcap_io.codec.records import MAGIC
 from imutool.mcap_io.index import LogIndex
-from imutool.mcap_io.storage.source import Digest
+from imutool.mcap_io.storage.source import BLOCK_BYTES, Digest
 
 # SHA-256 takes longer than `cp` (1.6 and 2 GB/s on the machine of docs/performance.md), and needs every byte of a chunk that
 # the kernel copies otherwise
@@ -26,7 +26,8 @@ class SourceDigest:
 
     def __init__(self, index: LogIndex, source: Location) -> None:
         self._index, self._size = index, index.source.size
-        self._whole = Digest(source) if self._size <= LARGEST_HASHED else None
+        self._own = index.source.path == source  # else the index is that of a repaired copy
+        self._whole = Digest(source, index.data_end if self._own else 0) if self._size <= LARGEST_HASHED else None
         self._stated = None if self._whole is not None else _stated(index)
 
     def result(self) -> dict[str, str]:
@@ -39,12 +40,41 @@ class SourceDigest:
             return {"source_sha256": self._whole.result()}
         return {"source_digest": self._stated or ""}
 
+    @property
+    def continues(self) -> bool:
+        """Whether a copy can continue the digest: it is of all bytes, and of the log that is copied."""
+        return self._whole is not None and self._own
+
+    def data(self) -> hashlib._Hash:
+        """SHA-256 of the bytes up to the end of the data section, to be continued."""
+        assert self._whole is not None, "it `continues`"
+        return self._whole.head()
+
     def __enter__(self) -> SourceDigest:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if self._whole is not None:
             self._whole.__exit__(kind, error, trace)
+
+
+def digest_with_crcs(index: LogIndex) -> str:
+    """SHA-256 of a log's bytes without the contents of chunks, for which their CRCs stand.
+
+    A chunk without CRC counts with its contents. If this digest and every CRC are right, every byte is as it was.
+    """
+    source, whole, done = index.source, hashlib.sha256(), 0
+    parts = []  # from `done` to the contents of the next chunk, and their end
+    for block in index.blocks:
+        if block.compression is not None:
+            head = block.head(source.at(block.offset, min(block.length, HEAD_BYTES)))
+            if head.crc:
+                parts.append((block.offset + head.data_at, block.offset + block.length))
+    for start, end in [*parts, (source.size, source.size)]:
+        for at in range(done, start, BLOCK_BYTES):
+            whole.update(source.at(at, min(BLOCK_BYTES, start - at)))
+        done = end
+    return whole.hexdigest()
 
 
 def _stated(index: LogIndex) -> str:
