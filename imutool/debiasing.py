@@ -254,6 +254,7 @@ def _debias(
             fit = model_choice.fitness_in_log(log, topic, chosen, start, survey).beside(wrong)
             fits[topic] = fit.report(models[topic], topic, force=options.force)
             records[topic] = _provenance(topic, chosen, start, options.init, options.smooth)
+
         sieves = {debiaser.source_topic: debiaser.sieve for debiaser in derived}
 
         def metadata(verified: Verified) -> Values:
@@ -264,8 +265,8 @@ def _debias(
             }
             return entries | {_record_name(CLEAN_RECORD, topic, records): found.record() for topic, found in surveys.items()}
 
-        ways = {"overwrite": options.overwrite, "own_encoding": options.encoding == "own"}
-        report = rewrite(log, target, derived, metadata=metadata, check=options.check, digest=digest, progress=progress, **ways)
+        chosen_ways = {"overwrite": options.overwrite, "own_encoding": options.encoding == "own"}
+        report = rewrite(log, target, derived, metadata=metadata, check=options.check, progress=progress, **chosen_ways)
     for topic, sieve in sieves.items():
         for text in sieve.warnings():
             logger.warning("%s %s: %s", source, topic, text)

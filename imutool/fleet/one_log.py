@@ -70,9 +70,7 @@ def work(task: Task, model: bytes | None = None) -> Result:
         _clear(task, job.target)
         entries = COMMANDS[task.settings.command](job)
         _refuse_changed(task, job.source, job.target)
-        if not entries.get("target_sha256"):
-            entries |= digest(job.target)
-        result = msgspec.structs.replace(result, **entries, target_bytes=identity(job.target)[0])
+        result = msgspec.structs.replace(result, **entries, target_bytes=identity(job.target)[0], **digest(job.target))
     except UntrustedError as error:
         result = msgspec.structs.replace(result, status="quarantined", error=str(error), exit_code=error.exit_code)
     except ImutoolError as error:
@@ -142,8 +140,7 @@ def _debias(job: _Job) -> dict[str, Any]:
         Imu(topic, report.models[topic], start.how, tuple(start.rest[:3].tolist()), tuple(start.rest[3:].tolist()))
         for topic, start in report.starts.items()
     )
-    entries: dict[str, Any] = {"messages": report.rewrite.copied, "imus": imus, "target_sha256": report.rewrite.sha256}
-    entries |= _lost(report.losses.plain())
+    entries: dict[str, Any] = {"messages": report.rewrite.copied, "imus": imus, **_lost(report.losses.plain())}
     if report.surveys:
         entries["score"] = min(survey.score for survey in report.surveys.values())
         found = (

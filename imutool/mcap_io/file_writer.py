@@ -129,7 +129,6 @@ class LogWriter:
         records.pack(compression)
         self.contents, self.finished = Contents(), False
         self.written: set[int] = set()  # schemas
-        self._definitions = bytearray()  # to be written before the next chunk
         self.target = Target(path, overwrite=overwrite, summing=data_crc)
         try:
             own = records.build(Header(profile="ros2", library=f"imutool {imutool.__version__}"))
@@ -175,7 +174,7 @@ class LogWriter:
         number = free_id(self.contents.channels, "channel")
         record = Channel(id=number, topic=topic, message_encoding=encoding, metadata=metadata, schema_id=schema_id)
         self.contents.channels[number] = record
-        self._definitions += records.build(record)
+        self.target.write(records.build(record))
         return number
 
     def _schema_of(self, topic: MessageTopic) -> int:
@@ -208,11 +207,7 @@ class LogWriter:
     def _write_schema(self, record: Schema) -> None:
         if record.id not in self.written:
             self.written.add(record.id)
-            self._definitions += records.build(record)
-
-    def _write_definitions(self) -> None:
-        self.target.write(self._definitions)
-        self._definitions.clear()
+            self.target.write(records.build(record))
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Writes a metadata record; bytes of a file name that are no UTF-8 are written as escapes."""
@@ -227,7 +222,6 @@ class LogWriter:
         packed = records.pack(name)(chunk.data)
         start_ns, end_ns = chunk.start_ns, int(chunk.times.max())
         head = records.chunk_head(chunk.data, packed, name, start_ns, end_ns)
-        self._write_definitions()
         offset = self.target.position
         self.target.write(head + packed)
         entry = records.ChunkHead.of(head, len(head) + len(packed), offset).index_at(offset, len(head) + len(packed))
@@ -258,7 +252,6 @@ class LogWriter:
         if self.finished:
             return
         self.finished = True
-        self._write_definitions()
         self.target.write(records.build(DataEnd(data_section_crc=self.target.crc)))
         start, offsets = self.target.position, b""
         self.target.summing, self.target.crc = True, 0  # from here on it is the summary's

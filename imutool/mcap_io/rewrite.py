@@ -6,8 +6,6 @@ those that were checked before the copy began (`Log.keep`) are only copied. Only
 the source has none or wrong ones. Messages outside chunks keep their bytes and are wrapped into chunks, because a reader that
 goes by chunk indexes would otherwise not find them beside the new ones.
 
-New chunks lie between those of the source, or with the `digest` of a small one behind them: both are then hashed in one pass.
-
 Where the source states the CRC of its data section, it is checked and the copy states one, for which every byte passes through
 memory (1.3 instead of 1.2 of the CPU time of `cp`, `pass` in `tests/bench/rewrite.py`). Where the source states none, as most
 recorders do, the copy states none.
@@ -34,15 +32,13 @@ from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.added_topics import DerivedStream, DerivedTopics, check_new_topics, define
 from imutool.mcap_io.passthrough.chunk_check import check_chunk, parts_of
-from imutool.mcap_io.passthrough.source_digest import SourceDigest
-from imutool.mcap_io.storage.target import PassThrough, copy_permissions
+from imutool.mcap_io.storage.target import PassThrough
 from imutool.mcap_io.verify import Verified, check_data_crc, check_mode, stated_crc, verify
 from imutool.mcap_io.write import CHUNK_BYTES
+from imutool.processes.system import give
 
 RUN_BYTES = 16 << 20  # of the source are copied at once; progress is reported between
-HELD_BYTES = 16 << 20  # of new messages that wait for the end of a log with a digest
 Values = Mapping[str, Mapping[str, str]]  # the entries of metadata records, by the records' names
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -56,7 +52,6 @@ class RewriteReport:
     source_bytes: int
     target_bytes: int
     verified: Verified
-    sha256: str = ""  # of the target, if it continues the digest of the source
 
 
 def rewrite(
@@ -68,13 +63,11 @@ def rewrite(
     overwrite: bool = False,
     check: str = "imu",
     own_encoding: bool = False,
-    digest: SourceDigest | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> RewriteReport:
     """Writes all of `source` to `target`, with derived topics and metadata records.
 
-    Derived messages are in chunks of their own; with `own_encoding` in their source's encoding (`added_topics.define`). With
-    the `digest` of a small source they stand behind its data: one pass then gives the SHA-256 of both.
+    Derived messages are in chunks of their own; with `own_encoding` in their source's encoding (`added_topics.define`).
 
     A derived message has log time, publish time and sequence of its source message. Where the source has a metadata record of
     the same name, both stand in the target; a function as `metadata` is called when all else is written.
@@ -104,19 +97,32 @@ def rewrite(
         packing = next((block.compression for block in log.index.blocks if block.compression is not None), "none")
         crc, header, replace = bool(stated_crc(log.index)), log.index.header_bytes, overwrite or target is None
         with LogWriter(place, compression=packing, overwrite=replace, header=header, data_crc=crc) as out:
-            report = _Rewrite(log, out, derived, check, own_encoding, progress or (lambda *_: None)).run(metadata, digest)
+            report = _Rewrite(log, out, derived, check, own_encoding, progress or (lambda *_: None)).run(metadata)
             if target is None and isinstance(path, Path) and isinstance(out.target.temporary, Path):
-                copy_permissions(path, out.target.temporary)
+                _copy_permissions(path, out.target.temporary)
             if identity(path) != log.index.source.identity:
                 raise LogError("the log changed while it was copied", where=path, fix="Wait until its recorder is done")
             return report
+
+
+def _copy_permissions(source: Path, target: Path) -> None:
+    """Gives the target the mode of the source, and its owner where the system allows it."""
+    status = source.stat()
+    give(target, status)
+    target.chmod(status.st_mode & 0o7777)
 
 
 class _Rewrite:
     """One pass over the source, and the verification of the target."""
 
     def __init__(
-        self, log: Log, out: LogWriter, derived: Sequence[DerivedTopics], check: str, own: bool, tell: Progress
+        self,
+        log: Log,
+        out: LogWriter,
+        derived: Sequence[DerivedTopics],
+        check: str,
+        own: bool,
+        tell: Callable[[int, int], None],
     ) -> None:
         self.log, self.index, self.source, self.out = log, log.index, log.index.source, out
         self.check, self.tell = check, tell
@@ -127,21 +133,19 @@ class _Rewrite:
         self.passing = PassThrough(self.source, out.target)
         self.checked = self.unchecked = 0  # chunks unpacked before or while copying; messages that no CRC covers
         self.new_chunks = set[int]()  # their offsets
-        self.digest: SourceDigest | None = None  # to be continued over the new chunks, which are held back
-        self.held: list[Chunk] = []
 
     def _stream(self, topics: DerivedTopics, own: bool) -> DerivedStream:
         source = self.log.topics[topics.source_topic]
         defined = [define(self.out, new, self.log, source, own=own) for new in topics.topics]
         return DerivedStream(self.log, topics, self.log.channel_ids(source.name), defined)
 
-    def run(self, metadata: Values | Callable[[Verified], Values], digest: SourceDigest | None) -> RewriteReport:
-        """Copies the log item by item with the new chunks between or behind them, ends it, and verifies it.
+    def run(self, metadata: Values | Callable[[Verified], Values]) -> RewriteReport:
+        """Copies the log item by item with the new chunks between them, ends it, and verifies it.
 
         Raises:
             LogError: the source is damaged, or the copy is.
         """
-        size, self.digest = self.source.size, digest if digest is not None and digest.continues else None
+        size = self.source.size
         with self.log.named():
             self._copy_all(size)
         contents = self.out.contents
@@ -161,8 +165,7 @@ class _Rewrite:
         added = {t.name: contents.counts[i] for s in self.streams for t, i in zip(s.derived.topics, s.ids, strict=True)}
         copied = contents.counts.total() - sum(added.values())
         unchecked = 0 if stated_crc(self.index) else self.unchecked  # else the CRC of the data section covers them
-        target = self.out.target
-        return RewriteReport(copied, added, len(contents.chunks), unchecked, size, target.position, verified, target.sha256)
+        return RewriteReport(copied, added, len(contents.chunks), unchecked, size, self.out.target.position, verified)
 
     def _copy_all(self, size: int) -> None:
         self.passing.skip(self.index.header_end)
@@ -181,9 +184,6 @@ class _Rewrite:
             stream.decode()
             self._write_new_chunk(stream)
         self.passing.flush()
-        if self.digest is not None and self.passing.verbatim and self.passing.copied == self.index.data_end:
-            self.out.target.digest = self.digest.data()
-        self._write_held()
         self.passing.skip(self.index.data_end)
         if self.out.target.summing:
             check_data_crc(self.index, self.passing.crc)
@@ -195,16 +195,9 @@ class _Rewrite:
 
     def _write_new_chunk(self, stream: DerivedStream) -> None:
         if stream.size:
-            self.held.append(stream.pop_chunk())
-        if self.digest is None or sum(len(chunk.data) for chunk in self.held) > HELD_BYTES:
-            self._write_held()
-
-    def _write_held(self) -> None:
-        for chunk in self.held:
             self.passing.flush()
             self.new_chunks.add(self.out.target.position)
-            self.out.chunk(chunk)
-        self.held.clear()
+            self.out.chunk(stream.pop_chunk())
 
     def _copy_block(self, block: MessageBlock) -> None:
         if block.compression is None:

@@ -26,8 +26,7 @@ class SourceDigest:
 
     def __init__(self, index: LogIndex, source: Location) -> None:
         self._index, self._size = index, index.source.size
-        self._own = index.source.path == source  # else the index is that of a repaired copy
-        self._whole = Digest(source, index.data_end if self._own else 0) if self._size <= LARGEST_HASHED else None
+        self._whole = Digest(source) if self._size <= LARGEST_HASHED else None
         self._stated = None if self._whole is not None else _stated(index)
 
     def result(self) -> dict[str, str]:
@@ -39,16 +38,6 @@ class SourceDigest:
         if self._whole is not None:
             return {"source_sha256": self._whole.result()}
         return {"source_digest": self._stated or ""}
-
-    @property
-    def continues(self) -> bool:
-        """Whether a copy can continue the digest: it is of all bytes, and of the log that is copied."""
-        return self._whole is not None and self._own
-
-    def data(self) -> hashlib._Hash:
-        """SHA-256 of the bytes up to the end of the data section, to be continued."""
-        assert self._whole is not None, "it `continues`"
-        return self._whole.head()
 
     def __enter__(self) -> SourceDigest:
         return self

@@ -103,13 +103,11 @@ def sha256(path: Location) -> str:
 class Digest:
     """SHA-256 of a file in a thread, while the caller reads it: the disk reads a block once.
 
-    A context manager: leaving it ends the thread, whether or not anybody asked for the result. `head` is the sum of the first
-    `head_bytes`, for another file that begins with them.
+    A context manager: leaving it ends the thread, whether or not anybody asked for the result.
     """
 
-    def __init__(self, path: Location, head_bytes: int = 0) -> None:
-        self._source, self._sum, self._head_bytes = Source(path), hashlib.sha256(), head_bytes
-        self._head = self._sum
+    def __init__(self, path: Location) -> None:
+        self._source, self._sum = Source(path), hashlib.sha256()
         self._error: ImutoolError | None = None
         self._left = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sha256", daemon=True)
@@ -118,12 +116,10 @@ class Digest:
     def _run(self) -> None:
         size = self._source.size
         try:
-            for first, end in ((0, self._head_bytes), (self._head_bytes, size)):
-                self._head = self._sum.copy()
-                for at in range(first, end, BLOCK_BYTES):
-                    if self._left.is_set():
-                        return
-                    self._sum.update(self._source.at(at, min(BLOCK_BYTES, end - at)))
+            for at in range(0, size, BLOCK_BYTES):
+                if self._left.is_set():
+                    return
+                self._sum.update(self._source.at(at, min(BLOCK_BYTES, size - at)))
         except LogError as error:  # raised by `result`
             self._error = error.at(self._source.path)
 
@@ -137,15 +133,6 @@ class Digest:
         if self._error is not None:
             raise self._error
         return self._sum.hexdigest()
-
-    def head(self) -> hashlib._Hash:
-        """The sum of the first bytes, to be continued.
-
-        Raises:
-            LogError: as `result`.
-        """
-        self.result()
-        return self._head.copy()
 
     def __enter__(self) -> Digest:
         return self

@@ -6,7 +6,6 @@ the bytes move by part of a block it takes 0.8 times as long as reading and writ
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import secrets
@@ -24,7 +23,6 @@ from imutool.mcap_io.storage.local import LocalFile, Stream, is_stream, remove_a
 from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.storage.source import BLOCK_BYTES, Source, crc_of
 from imutool.mcap_io.storage.upload import Upload
-from imutool.processes.system import give
 
 SIGNATURE = "# Exported by imutool"  # in the first lines of a file of every exported folder
 
@@ -44,7 +42,6 @@ class Target:
     def __init__(self, path: Location, *, overwrite: bool = False, summing: bool = True) -> None:
         self.path, self.overwrite = path, overwrite
         self.position, self.crc, self.summing = 0, 0, summing
-        self.digest: hashlib._Hash | None = None  # of everything so far, and from then on of what is written
         self._medium, self._errors = _medium(path), io_errors(path)
         self.temporary = self._medium.temporary
         # Ctrl-C may come between two lines, before `abandon` can be called: then the file goes with this object
@@ -81,13 +78,6 @@ class Target:
         self.position += len(data)
         if self.summing:
             self.crc = crc32(data, self.crc)
-        if self.digest is not None:
-            self.digest.update(data)
-
-    @property
-    def sha256(self) -> str:
-        """SHA-256 of everything so far, in hex; empty where nobody set `digest`."""
-        return "" if self.digest is None else self.digest.hexdigest()
 
     def copy(self, source: Source, start: int, end: int) -> None:
         """Appends bytes `start` to `end` of another file; the kernel copies if no CRC is needed.
@@ -96,7 +86,7 @@ class Target:
             ConfigError: the system refuses to write.
             LogError: the source does not have the bytes, or the disk does not give them.
         """
-        if not self.summing and self.digest is None:
+        if not self.summing:
             with self._system_errors():
                 stopped = self._medium.copy(source, start, end)
             self.position, start = self.position + stopped - start, stopped
@@ -144,13 +134,6 @@ def _medium(path: Location) -> LocalFile | Upload:
     return Stream(path) if is_stream(path) else LocalFile(path)
 
 
-def copy_permissions(source: Path, target: Path) -> None:
-    """Gives the target the mode of the source, and its owner where the system allows it."""
-    status = source.stat()
-    give(target, status)
-    target.chmod(status.st_mode & 0o7777)
-
-
 class PassThrough:
     """Copies a source into a target in order, with new records between those of the source."""
 
@@ -158,7 +141,6 @@ class PassThrough:
         self.source, self.target = source, target
         self.copied = self.crc = 0  # bytes of the source so far, and their CRC if it states one
         self.pending_end = 0  # the bytes from `copied` to here are to be copied, but not yet
-        self._left_out = False  # bytes behind the header
 
     @property
     def pending(self) -> int:
@@ -186,13 +168,7 @@ class PassThrough:
         """Skips the source's bytes up to `end`: another form of them is written, or none."""
         if self.target.summing:
             self.crc = crc_of(self.source, self.copied, end, self.crc)
-        self._left_out |= 0 < self.copied < end
         self.copied = self.pending_end = end
-
-    @property
-    def verbatim(self) -> bool:
-        """Whether the target is the source up to here, byte for byte."""
-        return not self._left_out and self.target.position == self.copied
 
     def write(self, raw: memoryview) -> int:
         """Copies bytes of the source that are in memory already; returns where they went."""

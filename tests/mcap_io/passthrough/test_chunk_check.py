@@ -8,43 +8,29 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.reader import make_reader
 
 from imutool.debiasing import Debiaser
 from imutool.errors import LogError
 from imutool.file_location import identity
-from imutool.mcap_io import rewrite as rewriting
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough import chunk_check, source_digest
 from imutool.mcap_io.passthrough.source_digest import SourceDigest
 from imutool.mcap_io.rewrite import RewriteReport, rewrite
-from imutool.mcap_io.storage.source import sha256
 
 Foreign = Callable[..., Path]
 Messages = list[tuple[Any, ...]]
 IMU = "/imu/data"
 
 
-def nothing_subtracted() -> Debiaser:
+def copied(source: Path, target: Path, keep_until_ns: int | None) -> RewriteReport:
     from imutool.bias import static
     from imutool.bias_start.initial_bias import from_numbers
 
-    return Debiaser(IMU, static.Model(), from_numbers("0,0,0,0,0,0"))
-
-
-def messages_of(path: Path) -> list[tuple[str, int, int, bytes]]:
-    """Topic, log time, sequence and payload of every message."""
-    with path.open("rb") as file:
-        found = [(c.topic, m.log_time, m.sequence, m.data) for _, c, m in make_reader(file).iter_messages(log_time_order=False)]
-    return sorted(found)
-
-
-def copied(source: Path, target: Path, keep_until_ns: int | None) -> RewriteReport:
     with Log(source) as log:
         log.keep([IMU])
         times = [int(t) for _, rows in log.rows([IMU], end_ns=keep_until_ns) for t in rows.log_time]
         assert times == [int(t) for stamps in log.stamps(IMU) for t in stamps if keep_until_ns is None or t <= keep_until_ns]
-        return rewrite(log, target, [nothing_subtracted()], metadata={})
+        return rewrite(log, target, [Debiaser(IMU, static.Model(), from_numbers("0,0,0,0,0,0"))], metadata={})
 
 
 def counted_chunks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
@@ -119,30 +105,3 @@ def test_a_large_log_has_a_digest_of_what_states_its_contents(
     assert list(stated) == ["source_digest"]
     changed = [*flight[:5], (*rest, bytes([*payload[:-1], payload[-1] ^ 1])), *flight[6:]]
     assert digest(foreign(changed, "zstd")) != stated
-
-
-@pytest.mark.parametrize("held_bytes", [1 << 24, 1 << 17, 0])
-def test_the_digest_of_a_copy_continues_that_of_its_source(
-    foreign: Foreign,
-    flight: Messages,
-    layout: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    held_bytes: int,
-) -> None:
-    monkeypatch.setattr(rewriting, "HELD_BYTES", held_bytes)
-    monkeypatch.setattr(rewriting, "CHUNK_BYTES", 1 << 15)  # some twenty new chunks
-    more = {"attachments": (b"abc" * 9,), "metadata": {"robot": {"id": "7"}}}
-    source, target, again = foreign(flight, layout, chunk_size=10_000, **more), tmp_path / "out.mcap", tmp_path / "again.mcap"
-    with Log(source) as log, SourceDigest(log.index, source) as digest:
-        data, origin = source.read_bytes()[: log.index.data_end], lambda _: {"imutool": digest.result()}
-        report = rewrite(log, target, [nothing_subtracted()], metadata=origin, check="all", digest=digest)
-    assert report.sha256 in ("", sha256(target))
-    verbatim = target.read_bytes().startswith(data)
-    assert verbatim == bool(report.sha256)
-    if layout in ("zstd", "lz4", "plain", "data-crc"):
-        assert verbatim == (held_bytes == 1 << 24)
-    with Log(source) as log, SourceDigest(log.index, target) as other:  # of another file than the log
-        report = rewrite(log, again, [nothing_subtracted()], metadata={}, digest=other)
-    assert report.sha256 == ""
-    assert messages_of(target) == messages_of(again)
