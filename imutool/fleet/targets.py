@@ -76,7 +76,7 @@ def without_suffix(log: str) -> str:
 
 
 def digest(target: Location) -> dict[str, str]:
-    """Name and digest of a target: SHA-256, or for a large log that in which the CRCs of its chunks count.
+    """Name and digest of a target: SHA-256, or for a large log `digest_with_crcs`.
 
     SHA-256 of all bytes would take a third of the time of a fleet of large logs.
     """
