@@ -105,7 +105,8 @@ def check_start_poses(recording: Recording) -> float:
                 warning.removesuffix(f"; {CORRECTION}"),
                 where=f"{recording.name} {recording.imu_topic}",
                 expected="poses and samples of one motion for a start from the truth",
-                fix=f"{CORRECTION if warning.endswith(CORRECTION) else 'See imutool info LOG'}, or give another `init`",
+                fix=f"{_correction(warning, truth) if warning.endswith(CORRECTION) else 'See imutool info LOG'},"
+                " or give another `init`",
             )
     delay = whole.conventions.delay
     clear = delay is not None and delay.step is None and abs(delay.seconds) > max(START_LATE_S, LATE_STDS * delay.std_s)
@@ -124,7 +125,7 @@ def check_poses(recording: Recording, *, world: bool = True) -> None:
     for finding in Axes().findings(whole):
         if "poses" in finding.values and (world or whole.quaternions or whole.position_unit != "m"):
             expected = "quaternions as w, x, y, z from body to world, z up, and metres"
-            raise DataError(finding.what, where=recording.name, expected=expected, fix=CORRECTION)
+            raise DataError(finding.what, where=recording.name, expected=expected, fix=_correction(finding.what, truth))
     for warning in _warnings(motion, whole):
         logger.warning("%s: %s", recording.name, warning)
 
@@ -134,8 +135,15 @@ def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> TopicSumma
     motion = motion_of(imu, truth)
     whole = motion.summary(truth)
     for warning in [*_warnings(motion, whole), *defect_warnings(imu, whole)]:
-        logger.warning("%s: %s", where, warning)
+        logger.warning("%s: %s", where, warning.replace(CORRECTION, _correction(warning, truth)))
     return whole
+
+
+def _correction(warning: str, truth: Truth | None) -> str:
+    """The command that corrects what a warning names; poses that are no truth are judged only if they are called one."""
+    if truth is None or truth.kind == "truth" or "poses" not in warning:
+        return CORRECTION
+    return CORRECTION.replace("--fix", f"--fix --kind {truth.topic}=truth")
 
 
 def check_one_sensor(recordings: Sequence[Recording]) -> None:
@@ -179,7 +187,8 @@ def check_motion(motion: ImuMotion, truth: Truth | None, where: str) -> None:
     for warning in _warnings(motion, motion.summary(truth)):
         if warning.endswith(CORRECTION):
             what = warning.removesuffix(f"; {CORRECTION}")
-            raise DataError(what, where=where, expected="units, axes and poses that agree", fix=CORRECTION)
+            expected = "units, axes and poses that agree"
+            raise DataError(what, where=where, expected=expected, fix=_correction(warning, truth))
         logger.warning("%s: %s", where, warning)
 
 

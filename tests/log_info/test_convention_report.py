@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.api.logs import export
 from imutool.api.models import debias as debias_recording
+from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.diagnosis.diagnose import diagnose
 from imutool.errors import DataError, ImutoolError, ModelError
@@ -198,6 +199,23 @@ def test_positions_of_another_world_or_unit_are_not_scored(
     assert found["aoe_deg"] > 0.0
     figures = [found[name] for name in ("ape_m", "velocity_rmse_m_s", "drift_velocity_m_s")]
     assert [figure is not None for figure in figures] == 3 * [scored]
+
+
+def test_the_command_that_corrects_estimated_poses_calls_them_true(
+    made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """`convert --fix` alone judges no poses of another kind."""
+    topic, log, fixed = "/ground_truth/pose", tmp_path / "log.mcap", tmp_path / "fixed.mcap"
+    write(in_ned(made), tmp_path / "true.mcap")
+    convert(tmp_path / "true.mcap", log, kinds=[f"{topic}=estimate"])
+    evaluate(log, truth=topic)
+    (told,) = [line.getMessage() for line in caplog.records if "has -z up" in line.getMessage()]
+    assert told.endswith(f"imutool convert LOG OUT --fix --kind {topic}=truth corrects it")
+    convert(log, fixed, kinds=[f"{topic}=truth"], correct=["conventions"])
+    caplog.clear()
+    (found,) = evaluate(fixed, truth=topic)
+    assert found["ape_m"] is not None
+    assert not caplog.records
 
 
 def test_a_log_as_it_should_be_brings_no_warning(made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
