@@ -73,7 +73,8 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
 def clock_of_numbers(values: np.ndarray) -> Int64[np.ndarray, " n"] | None:
     """Nanoseconds since the first midnight of numbers hhmmss; None for others.
 
-    They are written as 150405.12 or 150405120. Such numbers step by 40 s too much where a minute ends, and none of them has 60 seconds or more.
+    They are written as 150405.12 or 150405120. Such numbers step by 40 s too much where a minute ends, and none of them has
+    60 seconds or more.
     """
     if values.dtype.kind not in "iuf" or len(values) < 2 or not np.isfinite(values).all():
         return None

@@ -22,7 +22,7 @@ from imutool.log_info.imu_motion import ImuMotion, blocks_of, motion_of
 from imutool.log_info.pose_imu_rotation import CORRECTION, body_warnings, motion_warnings, unlike, velocities_judged
 from imutool.log_info.report import Convention, TruthInfo
 from imutool.mcap_io.log import Log
-from imutool.recording import Imu, Recording
+from imutool.recording import GRAVITY_M_S2, Imu, Recording
 
 logger = logging.getLogger(__name__)
 
@@ -34,6 +34,7 @@ CONVERTIBLE = {  # messages of which `convert` makes others
 }
 QUATERNIONS = "quaternions of poses"  # said only where they are misread
 START_LATE_S = 0.015  # half of what is a warning; a start from poses 10 ms late is off by about its standard deviation
+LEAST_VERTICAL = 0.85  # of gravity along the z of the poses, in the mean: 32 degrees
 NO_POSES = "the log has no true poses"
 NO_TURN = (
     "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or poses of another motion"
@@ -80,12 +81,31 @@ def _warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
     if not found.motion.samples:
         return []
     warnings = [*found.constant_sensors(), *convention_warnings(whole)]
-    turns = None if whole.truth is None or warnings else found.turns[whole.truth.topic].agreement()
+    return warnings or _pose_warnings(found, whole) or lean_warnings(found, whole)
+
+
+def _pose_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
+    """Warnings of poses that do not turn as the gyro does."""
+    turns = None if whole.truth is None else found.turns[whole.truth.topic].agreement()
     if whole.truth is None or turns is None:
-        return warnings
+        return []
     topic, turned_deg = whole.truth.topic, [] if turns.turned is None else turns.turned.deg.tolist()
     seen = turns.explained, turns.rms_rad_s, turns.jumps, turns.largest_jump_deg
     return [*body_warnings(topic, turned_deg), *motion_warnings(topic, *seen)]
+
+
+def lean_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
+    """Warning of an IMU that lies otherwise than the body of the poses, where no other warning is the cause.
+
+    Turns about one axis, as of wheels, do not show how it lies, but gravity does.
+    """
+    truth, vertical = whole.truth, whole.conventions.vertical_m_s2
+    if truth is None or vertical is None or vertical > LEAST_VERTICAL * GRAVITY_M_S2 or _pose_warnings(found, whole):
+        return []
+    causes = "the IMU lies otherwise than their body, their world is not z up, or gravity was subtracted"
+    return [
+        f"the accelerometer reads {vertical:.1f} m/s² along the z of the poses {truth.topic} in the mean, not gravity: {causes}"
+    ]
 
 
 def check_start_poses(recording: Recording) -> float:

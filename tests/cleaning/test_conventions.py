@@ -369,7 +369,8 @@ def test_wheel_odometry_of_another_frame_is_no_evidence() -> None:
     truth = of_poses("/odom", poses)
     assert truth is not None
     found = judge(motion_of(swapped), truth._replace(kind="unknown"), 1.0)
-    assert found == Conventions(topic="/odom", up=found.up, accel=found.accel, delay=found.delay)
+    assert found.vertical_m_s2 == pytest.approx(GRAVITY_M_S2, abs=0.1)
+    assert found == Conventions("/odom", accel=found.accel, up=found.up, delay=found.delay, vertical_m_s2=found.vertical_m_s2)
     assert found.up in (None, "+z")
 
 
