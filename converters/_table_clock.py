@@ -13,6 +13,7 @@ from ._table_text import Columns
 from ._table_times import (
     MOST_SKIPPED,
     PLAUSIBLE_HZ,
+    begun_anew,
     count_times,
     counters_of,
     counts_others,
@@ -38,14 +39,7 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
     gyro = proposal.unsigned("gyro", columns)
     length = len(columns.values[gyro[0]]) if gyro else None
     if "rate_hz" in given:
-        if counter := given.get("counter", ""):
-            column_named(columns, counter, "mapping")
-        if length:
-            counter = counter or next(filter(lambda c: _shows_losses(columns.values[c]), counters_of(columns, length)), "")
-            if counter and not given.get("counter"):
-                proposal.entries["counter"] = counter
-                proposal.reasons.append(f"{counter!r} counts the samples: rate_hz is that of its steps")
-            proposal.entries |= {"time": count_times(columns, given["rate_hz"], length, counter), "time_unit": "s"}
+        _count_at(proposal, columns, given, length or 0)
         return
     if "time" in given:
         column_named(columns, given["time"], "mapping")
@@ -93,9 +87,20 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
         )
 
 
+def _count_at(proposal: Proposal, columns: Columns, given: Entries, length: int) -> None:
+    """Count the samples at a given rate, by the given counter, or by one that shows which samples are lost."""
+    if counter := given.get("counter", ""):
+        column_named(columns, counter, "mapping")
+    elif counter := next(filter(lambda c: _shows_losses(columns.values[c]), counters_of(columns, length)), ""):
+        proposal.entries["counter"] = counter
+        proposal.reasons.append(f"{counter!r} counts the samples: rate_hz is that of its steps")
+    if length:
+        proposal.entries |= {"time": count_times(columns, given["rate_hz"], length, counter), "time_unit": "s"}
+
+
 def _shows_losses(counter: np.ndarray) -> bool:
     """Whether the steps of a counter that are longer than the usual one are lost samples, as far as it shows."""
-    return not counts_others(counter) and share_skipped(counter) <= MOST_SKIPPED
+    return not (len(begun_anew(counter)) or counts_others(counter)) and share_skipped(counter) <= MOST_SKIPPED
 
 
 def _unnamed_time(

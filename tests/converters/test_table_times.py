@@ -322,7 +322,10 @@ def test_a_table_without_any_time_is_read_by_a_map_with_a_rate(tmp_path):
 
 @pytest.mark.parametrize("every", [1, 3, 0])
 def test_a_rate_alone_keeps_the_gaps_that_a_counter_shows(tmp_path, every):
-    """The message that asks for the rate proposes the counter; `--map rate_hz=250` says no more. Row numbers that jump are none."""
+    """The message that asks for the rate proposes the counter, and `--map rate_hz=250` does not undo that.
+
+    Numbers that jump by one and two count no samples.
+    """
     names = ["n_samples", *(f"acc_{a}" for a in "xyz"), *(f"gyr_{a} [rad/s]" for a in "xyz")]
     rows = np.delete(np.arange(COUNT), [70, 71, 72]) if every else np.arange(COUNT)
     counter = every * np.arange(COUNT) if every else np.cumsum(1 + np.arange(COUNT) % 2)
