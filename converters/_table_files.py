@@ -24,7 +24,7 @@ from ._table_mocap import is_mocap, read_mocap
 from ._table_names import group_of, leaf_of, tells_apart
 from ._table_numbers import is_number
 from ._table_packed import read_bytes, text_head
-from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated
+from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated, state_mip
 from ._table_sensors import read_rows
 from ._table_sheets import load_sheets
 from ._table_text import FIRSTS, WIDEST, Columns, is_text_table, read_csv, text_of
@@ -75,6 +75,7 @@ def load(path: Path, kind: str) -> Columns:
     columns = Columns()
     with refusing(path):
         LOADERS[kind](path, columns)
+    state_mip(columns)
     scale_stated(columns)
     join_stamps(columns)
     join_gps_weeks(columns)

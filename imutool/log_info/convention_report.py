@@ -95,9 +95,9 @@ def _pose_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
 
 
 def lean_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
-    """Warning of an IMU that lies otherwise than the body of the poses, where no other warning is the cause.
+    """Warning of an IMU that lies otherwise than the body of the poses.
 
-    Turns about one axis, as of wheels, do not show how it lies, but gravity does.
+    It comes where no other warning names the cause. Turns about one axis, as of wheels, do not show how it lies; gravity does.
     """
     truth, vertical = whole.truth, whole.conventions.vertical_m_s2
     if truth is None or vertical is None or vertical > LEAST_VERTICAL * GRAVITY_M_S2 or _pose_warnings(found, whole):
