@@ -169,11 +169,11 @@ def _turns_against_poses(
 ) -> Sequence[tuple[Reading | None, Truth, str]]:
     """Readings of the gyro against the poses, the poses, and what is wrong with their quaternions; the least turn first.
 
-    Misread ones leave no gyro, or no axes that are sure and those of the log, and otherwise fit it clearly better, turned at
-    most. Several fit alike, up to a turn of the world.
+    Misread ones leave no gyro, or no sure axes that are those of the log, and otherwise fit it clearly better, turned at most.
+    Several fit alike, up to a turn of the world.
     """
     gyro = _gyro_against_poses(step, mean, start_ns, truth)
-    if gyro is not None and gyro.sole and not gyro.wrong:
+    if gyro is not None and gyro.sole and gyro.as_is:
         return [(gyro, truth, "")]
     fitting: list[tuple[Reading, Truth, str]] = []
     for what in MISREAD:
