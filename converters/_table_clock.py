@@ -7,12 +7,13 @@ import re
 import numpy as np
 
 from ._table_groups import TRUE_GROUPS, shared_group
-from ._table_map import Entries, Proposal, column_named
+from ._table_map import RATE_TO_STATE, Entries, Proposal, column_named
 from ._table_names import TIME_WORDS, XSENS_TIME, name_and_unit, spaced_name, unit_named
 from ._table_text import Columns
 from ._table_times import (
     MOST_SKIPPED,
     PLAUSIBLE_HZ,
+    begun_anew,
     count_times,
     counters_of,
     counts_others,
@@ -38,10 +39,7 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
     gyro = proposal.unsigned("gyro", columns)
     length = len(columns.values[gyro[0]]) if gyro else None
     if "rate_hz" in given:
-        if counter := given.get("counter", ""):
-            column_named(columns, counter, "mapping")
-        if length:
-            proposal.entries |= {"time": count_times(columns, given["rate_hz"], length, counter), "time_unit": "s"}
+        _count_at(proposal, columns, given, length or 0)
         return
     if "time" in given:
         column_named(columns, given["time"], "mapping")
@@ -85,8 +83,24 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
     _propose_time_unit(proposal, column, names, columns)
     if column in counters and "time_unit" in proposal.open:
         proposal.hints.append(
-            f"rate_hz = 100.0 and counter = {column!r}  # in place of time and time_unit, if it counts samples"
+            f"rate_hz = {RATE_TO_STATE} and counter = {column!r}  # in place of time and time_unit, if it counts samples"
         )
+
+
+def _count_at(proposal: Proposal, columns: Columns, given: Entries, length: int) -> None:
+    """Count the samples at a given rate, by the given counter, or by one that shows which samples are lost."""
+    if counter := given.get("counter", ""):
+        column_named(columns, counter, "mapping")
+    elif counter := next(filter(lambda c: _shows_losses(columns.values[c]), counters_of(columns, length)), ""):
+        proposal.entries["counter"] = counter
+        proposal.reasons.append(f"{counter!r} counts the samples: rate_hz is that of its steps")
+    if length:
+        proposal.entries |= {"time": count_times(columns, given["rate_hz"], length, counter), "time_unit": "s"}
+
+
+def _shows_losses(counter: np.ndarray) -> bool:
+    """Whether the steps of a counter that are longer than the usual one are lost samples, as far as it shows."""
+    return not (len(begun_anew(counter)) or counts_others(counter)) and share_skipped(counter) <= MOST_SKIPPED
 
 
 def _unnamed_time(

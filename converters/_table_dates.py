@@ -20,6 +20,9 @@ LEAP_SECONDS = (  # by which GPS is ahead of UTC, since then
     ("2006-01-01", 14),
     ("1999-01-01", 13),
 )
+PARTS_OF_SECOND = 1, 10, 100, 1000, 10**6  # behind hhmmss, without a point
+LONGEST_END_NS = 20 * 10**9  # step across the end of a minute that shows it; numbers that only count step by 40 s there
+LONGEST_STEP_NS = 2 * 10**9  # in the mean; 0, 50, 100, 150, ... would be 0:00, 0:50, 1:00, 1:50
 DAYTIME = r"\d\d?:\d\d:\d\d([.,]\d+)?( ?[ap]m)?"
 SPANS = "elapsed|duration|relative|since"  # in the name of a column of times that are none of the day
 DAY = r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([./])\d\d?\2\d{4}"
@@ -65,6 +68,26 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
     if slashes:
         notes.append(f"its dates count as {'day/month' if day_first else 'month/day'}/year")
     return np.array(stamps, np.int64), notes
+
+
+def clock_of_numbers(values: np.ndarray) -> Int64[np.ndarray, " n"] | None:
+    """Nanoseconds since the first midnight of numbers hhmmss; None for others.
+
+    They are written as 150405.12 or 150405120. Such numbers step by 40 s too much where a minute ends, and none of them has
+    60 seconds or more.
+    """
+    if values.dtype.kind not in "iuf" or len(values) < 2 or not np.isfinite(values).all():
+        return None
+    for parts in PARTS_OF_SECOND:
+        seconds, minutes, hours = values % (100 * parts) / parts, values // (100 * parts) % 100, values // (10_000 * parts)
+        if values.min() < 0 or hours.max() >= 24 or minutes.max() >= 60 or seconds.max() >= 60.0:
+            continue
+        t_ns = np.rint((hours * 3600.0 + minutes * 60.0 + seconds) * 1e9).astype(np.int64)
+        t_ns += 24 * HOUR_NS * np.concatenate([[0], np.cumsum(np.diff(t_ns) < -12 * HOUR_NS)])
+        steps, ends = np.diff(t_ns), np.diff(minutes) != 0
+        if ends.any() and steps.min() >= 0 and steps[ends].min() < LONGEST_END_NS and steps.mean() < LONGEST_STEP_NS:
+            return t_ns
+    return None
 
 
 def damaged_times(texts: list[str]) -> list[tuple[int, str]]:

@@ -24,11 +24,11 @@ from ._table_mocap import is_mocap, read_mocap
 from ._table_names import group_of, leaf_of, tells_apart
 from ._table_numbers import is_number
 from ._table_packed import read_bytes, text_head
-from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated
+from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated, state_mip
 from ._table_sensors import read_rows
 from ._table_sheets import load_sheets
 from ._table_text import FIRSTS, WIDEST, Columns, is_text_table, read_csv, text_of
-from ._table_times import join_gps_weeks, read_serial_days
+from ._table_times import join_gps_weeks, read_clocks_and_days
 
 NO_NUMBERS = "holds no columns of numbers"
 MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own in HDF5
@@ -75,10 +75,11 @@ def load(path: Path, kind: str) -> Columns:
     columns = Columns()
     with refusing(path):
         LOADERS[kind](path, columns)
+    state_mip(columns)
     scale_stated(columns)
     join_stamps(columns)
     join_gps_weeks(columns)
-    read_serial_days(columns)
+    read_clocks_and_days(columns)
     sort_by_clock(columns)
     if not columns.values:
         why = "".join(f"; {loss}" for loss in columns.remarks.losses[:1])

@@ -8,6 +8,7 @@ among them, is a table too if it has the name of a sensor (`gyro/t` and `gyro/va
 
 from __future__ import annotations
 
+import logging
 import re
 from collections import Counter
 from contextlib import suppress
@@ -36,7 +37,9 @@ from .px4_csv import logs_in
 from .sensor_tables import is_phone
 
 MOST_TABLES = 40  # of one recording
+MOST_NAMED = 5  # of tables that are left out
 DATA_FILE = "data.hdf5"  # of RoNIN
+logger = logging.getLogger(__name__)
 ENDINGS = (
     ".csv",
     ".txt",
@@ -80,6 +83,12 @@ def _sequences_in(folder: Path) -> list[Sequence]:
     if kind_of(head(folder / DATA_FILE), folder / DATA_FILE) == "hdf5":
         return [Sequence(folder.name, folder / DATA_FILE)]
     found = {} if is_phone(folder) or logs_in(folder) else _recordings(folder)
+    used = {path for tables in found.values() for path in tables}
+    others = {path: kind_of(head(path), path) for path in _tables(folder) if path.is_file() and path not in used}
+    left = [path.name for path, kind in others.items() if kind in ("csv", "") or (kind != "json" and look(path).header)]
+    if found and left:  # settings in JSON are none, and damaged ones are told of
+        more = f" and {len(left) - MOST_NAMED} more" if len(left) > MOST_NAMED else ""
+        logger.warning("%s: tables that show no IMU are left out: %s%s", folder, ", ".join(left[:MOST_NAMED]), more)
     places = {name: (next(iter(tables)), "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
     return [Sequence(folder.name if len(found) == 1 else name, *place) for name, place in places.items()]
 

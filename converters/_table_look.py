@@ -20,20 +20,21 @@ from ._table_packed import opener, text_head
 from ._table_pose_names import has_poses
 from ._table_propose import propose
 from ._table_sensors import name_columns
-from ._table_text import Columns, read_csv, text_of
+from ._table_text import LEAST_NUMBERS, Columns, is_text_table, read_csv, text_of
 from ._table_units import TIME_NS
 
 MOST_LOOKED = 64 << 20  # bytes of a table that is no text
 LAST_BYTES = 4096  # of a text, which hold its last row
+NARROW = 2  # numbers in a row of a time and a reading
 LEAST_VECTOR = 3  # numbers in a row of a sensor
 MOST_LARGER = 1.2  # ratio of the sizes of files, or of the times, of IMUs that were recorded together
 SINCE_1970_NS = 10**18  # in 2001; smaller times may count from any start
 logger = logging.getLogger(__name__)
 
 
-def _start(path: Path) -> str:
-    """First whole lines of a table of text; none of any other."""
-    if kind_of(head(path), path) != "csv":
+def _start(path: Path, kind: str) -> str:
+    """First whole lines of a table of text, also of a narrow one; none of any other file."""
+    if kind != "csv" and (kind or not is_text_table(text_head(path), NARROW)):
         return ""
     return text_of(text_head(path)).rpartition("\n")[0]
 
@@ -57,9 +58,10 @@ def look(path: Path) -> Seen:
 
 @lru_cache(maxsize=4096)
 def _looked(path: Path, mtime_ns: int, size: int) -> Seen:  # the key notices a changed file
-    columns, start, kind = Columns(), _start(path), kind_of(head(path), path)
-    if start and is_mocap(start):
-        read_csv(start, columns, path)
+    columns, kind = Columns(), kind_of(head(path), path)
+    start = _start(path, kind)
+    if start and (is_mocap(start) or not kind):
+        read_csv(start, columns, path, least=LEAST_NUMBERS if kind else NARROW)
     elif start:
         read_text(start, columns, path)
     elif kind not in ("csv", "") and size <= MOST_LOOKED:

@@ -39,6 +39,7 @@ TRUTH_GROUP, POSES_GROUP = "ground_truth", "poses"  # of that other table
 POSE_GROUPS = f"{TRUTH_GROUP}/", f"{POSES_GROUP}/"
 OF_COUNTS = {"gyro_scale", "gyro_offset", "accel_scale", "accel_offset"}
 NO_UNIT = "the names of the columns state no unit of the {} that imutool knows, and its values show none"
+RATE_TO_STATE = "SAMPLES_A_SECOND"  # no number: one that is copied would be wrong
 
 Entries = dict[str, Any]  # of a map: names, lists of names, numbers
 IN_WHOLE = "gyro", "gyro_unit", "accel", "accel_unit"  # entries with which, and a time, a map needs nothing from the table
@@ -190,9 +191,10 @@ class Proposal(msgspec.Struct):
 
     def in_words(self) -> str:
         """What is open as `name=value`, where names and numbers settle it."""
-        asked = {name: f"{name}={' or '.join(UNITS_OF.get(name, ['100.0']))}" for name in self.open}
+        asked = {name: f"{name}={' or '.join(UNITS_OF.get(name, [RATE_TO_STATE]))}" for name in self.open}
         if "time" in self.open:
-            asked = {"rate_hz": "rate_hz=100.0", **{name: text for name, text in asked.items() if not name.startswith("time")}}
+            others = {name: text for name, text in asked.items() if not name.startswith("time")}
+            asked = {"rate_hz": f"rate_hz={RATE_TO_STATE}", **others}
         return f"what is open ({', '.join(asked.values())}), or " if asked.keys() <= {*UNITS_OF, "rate_hz"} else ""
 
     def toml(self, several: Sequence[str] = (), *, own_times: bool = False) -> str:
@@ -214,7 +216,7 @@ class Proposal(msgspec.Struct):
                 f"# it holds for {', '.join(several)}; for one of them alone, name its columns: gyro = [...], accel = [...]"
             )
         if {"time", "time_unit"} & {*self.open}:
-            lines.append("# without a column of times: rate_hz = 100.0, the samples a second, in place of time and time_unit")
+            lines.append(f"# without a column of times: rate_hz = {RATE_TO_STATE}, in place of time and time_unit")
         lines += [f"# {hint}" for hint in self.hints]
         lines.append(
             "# raw counts: gyro_offset, gyro_scale, accel_offset, accel_scale give (count - offset) * scale in the unit"

@@ -1,5 +1,6 @@
 """Columns that a program states elsewhere than in a header, and multiples of units in one.
 
+Programs for MicroStrain's sensors put the number of MIP's field behind the names (`X Accel [x8004]`); each field has one unit.
 A VectorNav sensor writes sentences whose name says what is in them (`$VNIMU,...*66`), by its user manual. A log of Gyroflow
 (.gcsv) holds raw numbers, with their scales above the table: of time in s, gyro in rad/s, accel in g.
 """
@@ -18,6 +19,7 @@ SENTENCES = {
     "VNYMR": ["yaw", "pitch", "roll", *MAG, *IMU],
     "VNQMR": ["qx", "qy", "qz", "qw", *MAG, *IMU],
 }
+MIP_UNITS = {"[x8004]": "g", "[x8005]": "rad/s"}  # of scaled accelerations and rates, by MicroStrain's protocol
 LOOKED_AT = 4096  # first characters of a text
 GYROFLOW = "GYROFLOW IMU LOG"
 SCALES = {"tscale": ("t", "s"), "gscale": (r"g[xyz]", "rad/s"), "ascale": (r"a[xyz]", "g")}  # columns, and their unit after it
@@ -47,6 +49,11 @@ def scale_stated(columns: Columns) -> None:
             scaled.append(f"{column} by {factor:g} to {unit}")
     if scaled:
         columns.remarks.notes.append(f"multiplied as the header states: {', '.join(scaled)}")
+
+
+def state_mip(columns: Columns) -> None:
+    """Enter the units of MIP's fields, whose numbers stand behind the names of columns."""
+    columns.units |= {column: unit for column in columns.values for end, unit in MIP_UNITS.items() if column.endswith(end)}
 
 
 def scale_gyroflow(columns: Columns) -> None:

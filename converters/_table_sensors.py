@@ -119,11 +119,11 @@ def read_rows(text: str, columns: Columns, path: Path) -> bool:
 
 
 def _split_rows(start: str) -> tuple[str, list[list[str]]]:
-    """Delimiter of the first whole lines of a text, and their fields."""
+    """Delimiter of the first whole lines of a text, and their fields; a spreadsheet adds empty ones at the end."""
     lines = [line for line in start.splitlines()[:-1] if line.strip() and not line.startswith(COMMENTS)]
     marks = Counter(mark for line in lines for mark in ";\t, " if line.count(mark) >= PLACES)  # of equals the first
     mark = marks.most_common(1)[0][0] if marks else ""
-    return mark, [line.split(mark) for line in lines] if mark else []
+    return mark, [line.rstrip(f"{mark}\r\n").split(mark) for line in lines] if mark else []
 
 
 def _rows_of_kinds(start: str) -> tuple[str, int, dict[str, str]] | None:

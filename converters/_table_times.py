@@ -11,7 +11,7 @@ from imutool.array_types import Float64, Int64
 from imutool.errors import ConfigError
 from imutool.recording.message_log import MessageLog
 
-from ._table_dates import WEEK_NS, gps_times
+from ._table_dates import WEEK_NS, clock_of_numbers, gps_times
 from ._table_names import TIME_WORDS, name_and_unit, split_name, unit_named
 from ._table_text import Columns
 from ._table_units import TIME_NS, USUAL_TIME_NS
@@ -66,14 +66,19 @@ def join_gps_weeks(columns: Columns) -> None:
     columns.remarks.notes.append(f"{weeks[0]!r} and {times[0]!r} are UTC in the log, {leap_s} leap seconds behind GPS")
 
 
-def read_serial_days(columns: Columns) -> None:
-    """Make nanoseconds of times in days as Excel and MATLAB count them.
+def read_clocks_and_days(columns: Columns) -> None:
+    """Make nanoseconds of times as numbers hhmmss, and of days as Excel and MATLAB count them.
 
-    They begin in 1899 and in the year 0. Steps of a sensor are so small in days that they fit no other unit.
+    Days begin in 1899 and in the year 0. Steps of a sensor are so small in days that they fit no other unit.
     """
     for column, values in columns.values.items():
         name, unit = name_and_unit(column, columns.units.get(column, ""))
         is_named = re.search(r"time|date|day|stamp|utc", name) or re.fullmatch(TIME_WORDS, name)
+        if is_named and (t_ns := clock_of_numbers(values)) is not None:
+            columns.values[column], columns.units[column] = t_ns, "ns"
+            columns.texts.pop(column, None)
+            columns.remarks.notes.append(f"{column!r} holds hours, minutes and seconds (hhmmss), from the start of the day")
+            continue
         if values.dtype.kind != "f" or unit not in ("", "day") or not is_named or not np.isfinite(values).all():
             continue
         for program, start in SERIAL_DAYS.items():
@@ -107,8 +112,8 @@ def in_batches(values: np.ndarray) -> bool:
     """Whether a time stands still and rises by turns, with about as many rows for each stamp."""
     steps = np.diff(values.astype(float))
     rows = np.diff(np.flatnonzero(steps != 0))
-    if len(rows) < FEWEST_BATCHES or float(np.mean(steps >= 0)) <= 0.99:
-        return False
+    if len(rows) < FEWEST_BATCHES or float(np.mean(steps >= 0)) <= 0.99 or np.median(rows) <= 1.0:
+        return False  # with one row for each stamp it only rises
     return float(np.mean(np.abs(rows / np.median(rows) - 1.0) <= ROWS_APART)) >= ROWS_ALIKE
 
 

@@ -30,6 +30,7 @@ WINDOW = 5  # steps of 0.1 s over which the gyro must carry gravity along
 MOST_WINDOWS = 600  # evenly taken from a longer log
 TURNING = 0.4  # of the turn of the liveliest tenth of the windows, that of a window that counts
 STRAIGHT_DEG = 15.0  # three deviations above a rotation between gyro and poses that leaves no other order of the axes
+LEAST_MEAN_S = 10.0  # in which a vehicle that gains 10 m/s upwards changes the mean by a tenth of gravity
 FASTEST_RAD_S = 70.0  # 4000 degrees a second: faster, a reading is in another unit
 
 
@@ -43,6 +44,7 @@ class Conventions:
         up: axis of the poses' world that points up, as `+z`.
         unit: of the poses' positions, metres unless the motion shows another.
         quaternions: what is wrong with those of the poses (`pose_quaternions`); then all else is of the poses without this.
+        vertical_m_s2: mean specific force along the z of the poses' world, gravity where the IMU lies as their body does.
     """
 
     topic: str = ""
@@ -53,6 +55,7 @@ class Conventions:
     delay: Delay | None = None  # of the poses
     unit: str = "m"
     quaternions: str = ""
+    vertical_m_s2: float | None = None
 
 
 def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventions:
@@ -71,7 +74,8 @@ def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventio
         if relative is None and gyro is not None and gyro.wrong and gyro.sole:
             carried = _against_gravity(step, mean, gyro.axes)
         accel, up, unit, other = _accel_against_poses(step, force, motion.middle_ns, poses, gyro, carried)
-        found.append(Conventions(truth.topic, gyro, accel, carried, up, delay, unit, what or other))
+        vertical = _mean_vertical(step, force, motion.middle_ns, poses)
+        found.append(Conventions(truth.topic, gyro, accel, carried, up, delay, unit, what or other, vertical))
     return max(found, key=lambda each: (each.up == "+z", each.accel is not None))  # of equals the first
 
 
@@ -165,11 +169,11 @@ def _turns_against_poses(
 ) -> Sequence[tuple[Reading | None, Truth, str]]:
     """Readings of the gyro against the poses, the poses, and what is wrong with their quaternions; the least turn first.
 
-    Misread ones leave no gyro or other axes, and otherwise fit it clearly better, turned at most. Several fit alike, up to a
-    turn of the world.
+    Misread ones leave no gyro, or no sure axes that are those of the log, and otherwise fit it clearly better, turned at most.
+    Several fit alike, up to a turn of the world.
     """
     gyro = _gyro_against_poses(step, mean, start_ns, truth)
-    if gyro is not None and not gyro.wrong:
+    if gyro is not None and gyro.sole and gyro.as_is:
         return [(gyro, truth, "")]
     fitting: list[tuple[Reading, Truth, str]] = []
     for what in MISREAD:
@@ -219,6 +223,26 @@ def _nearest(choice: Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "
     return _reading(choice._replace(best=nearest), readings)._replace(sole=False)
 
 
+def _force_at_poses(
+    step: Int64[np.ndarray, " m"], accel: Float64[np.ndarray, "m 3"], start_ns: int, truth: Truth
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 4"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+    """Times of the poses that have samples, their orientation and acceleration, and the specific force there."""
+    at_ns, q_wb, a_w = force_in_world(truth)
+    use, first_s, _ = usable(at_ns, at_ns + 1, start_ns, step)
+    f = np.stack([np.interp(first_s, STEP_S * (step + 0.5), column) for column in accel.T], axis=1)
+    return first_s, q_wb[use], a_w[use], f
+
+
+def _mean_vertical(
+    step: Int64[np.ndarray, " m"], accel: Float64[np.ndarray, "m 3"], start_ns: int, truth: Truth
+) -> float | None:
+    """Mean specific force along the z of the poses; their own acceleration has no mean worth naming over `LEAST_MEAN_S`."""
+    first_s, q_wb, _, f = _force_at_poses(step, accel, start_ns, truth)
+    if not len(f) or first_s[-1] - first_s[0] < LEAST_MEAN_S:
+        return None
+    return float(quaternion.rotate(q_wb, f)[:, 2].mean())
+
+
 def _accel_against_poses(
     step: Int64[np.ndarray, " m"],
     accel: Float64[np.ndarray, "m 3"],
@@ -231,31 +255,29 @@ def _accel_against_poses(
 
     a_w + g up = R_wb axes f. Without acceleration, or in noise, (axes, up) and (-axes, -up) fit alike: the up of right axes.
     """
-    at_ns, q_wb, a_w = force_in_world(truth)
-    use, first_s, _ = usable(at_ns, at_ns + 1, start_ns, step)
-    if len(use) < FEWEST_BLOCKS:
+    first_s, q_wb, a_w, f = _force_at_poses(step, accel, start_ns, truth)
+    if len(f) < FEWEST_BLOCKS:
         return None, None, "m", ""
-    f = np.stack([np.interp(first_s, STEP_S * (step + 0.5), column) for column in accel.T], axis=1)
     ups = np.concatenate([np.eye(3)[2:], -np.eye(3)[2:], np.eye(3)[:2], -np.eye(3)[:2]])
     every = signed_permutations()
     if gyro is not None and gyro.sole and relative is not None:  # axes that agree with the gyro's, up to the sign of gravity
         agreed = np.linalg.det(gyro.axes) * gyro.axes @ relative.axes.T * np.linalg.det(relative.axes)
         every = np.stack([agreed, -agreed])
     readings = [(P, up) for P in every for up in ups]
-    turned = np.stack([quaternion.rotate(q_wb[use], f @ P.T) for P in every])
-    blocks, misfits = (first_s / BLOCKS_S).astype(np.int64), Misfits(a_w[use], turned, GRAVITY_M_S2 * ups)
+    turned = np.stack([quaternion.rotate(q_wb, f @ P.T) for P in every])
+    blocks, misfits = (first_s / BLOCKS_S).astype(np.int64), Misfits(a_w, turned, GRAVITY_M_S2 * ups)
     unit = position_unit(misfits, blocks)
     misfits = misfits._replace(a_w=POSITIONS[unit] * misfits.a_w)
     a_w, choice = misfits.a_w, choose(misfits.sizes(1.0), blocks)
     straight = gyro is not None and gyro.as_is and (gyro.sole or gyro.straight)
     left = np.zeros((0, 3)) if choice is None else misfits.of(1.0, choice.best)
-    if straight and is_other_world(f, q_wb[use], a_w, left, blocks):
+    if straight and is_other_world(f, q_wb, a_w, left, blocks):
         return None, None, unit, OTHER_WORLD
-    in_mean = axis_of_gravity(quaternion.rotate(q_wb[use], f)) if straight else None
+    in_mean = axis_of_gravity(quaternion.rotate(q_wb, f)) if straight else None
     if choice is None or choice.misfit[choice.best] > CLEARLY * GRAVITY_M_S2:
         return None, in_mean, unit, ""
     P, up = readings[choice.best]
-    as_is = float(np.sqrt(median(np.sum((a_w + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb[use], f)) ** 2, axis=1))))
+    as_is = float(np.sqrt(median(np.sum((a_w + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb, f)) ** 2, axis=1))))
     alike = [readings[row] for row in np.flatnonzero(choice.alike).tolist()]
     one_axes = all((other == P).all() for other, _ in alike)
     found = Reading(P, "m/s^2", choice.certain, float(choice.misfit[choice.best]), as_is) if one_axes else None

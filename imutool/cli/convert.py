@@ -134,7 +134,7 @@ def _tell(report: ConvertReport, common: Common) -> None:
 def _grouped(sentences: list[str]) -> list[str]:
     """Sentences `LOG: TEXT`, each text once, in front of it the first of its logs and the number of the others."""
     logs: dict[str, list[str]] = {}
-    for sentence in sentences:
+    for sentence in dict.fromkeys(sentences):  # both rounds of a correction may say the same
         log, colon, text = sentence.partition(": ")
         logs.setdefault(colon + text, []).append(log)
     others = {text: f" and {len(names) - 1} other{'s' if len(names) > 2 else ''}" for text, names in logs.items()}

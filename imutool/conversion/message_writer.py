@@ -148,13 +148,16 @@ class _Stream:
     def chunks(self) -> Iterator[tuple[Chunk, str | None]]:
         """Chunks of about 1 MiB as they fill, and the rest at the end."""
         last, longest, jumps, stamps = None, nanoseconds(MOST_GAP_S), list[tuple[int, float]](), SharedStamps()
+        before, jump = set[int](), (0, 0.0)
         for topic, log_time, publish_time, payload in self._source.messages():
             if (number := self.channels.get(topic)) is None:
                 number = self._define(topic, payload)
             if not 0 <= log_time <= LATEST_NS:
                 raise DataError(f"a message of {topic.name} has the time {log_time} ns", expected="a time from 1970 to 2262")
             if last is not None and abs(log_time - last) > longest and len(jumps) < MOST_JUMPS:
-                jumps.append((log_time, (log_time - last) * 1e-9))
+                before, jump = set(self._begun), (log_time, (log_time - last) * 1e-9)
+            if number in before:  # and no topic with a clock of its own
+                jumps, before = [*jumps, jump], set()
             last = log_time
             self._pairs.take(topic, log_time, payload)
             stamps.take(topic, payload)
@@ -284,11 +287,8 @@ def _encode_table(columns: Shaped[np.ndarray, " n"]) -> UInt8[np.ndarray, "n L"]
 
 def _fields(dtype: np.dtype[np.void]) -> dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]]:
     """Type and shape of every column."""
-    every = {}
-    for name in dtype.names or ():
-        field = dtype[name]
-        every[name] = (field.subdtype[0], field.shape) if field.subdtype else (field, ())
-    return every
+    fields = ((name, dtype[name]) for name in dtype.names or ())
+    return {name: (field.subdtype[0], field.shape) if field.subdtype else (field, ()) for name, field in fields}
 
 
 def _compare(source: MessageLog, written: Counter[str]) -> None:

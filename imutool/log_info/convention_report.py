@@ -22,7 +22,7 @@ from imutool.log_info.imu_motion import ImuMotion, blocks_of, motion_of
 from imutool.log_info.pose_imu_rotation import CORRECTION, body_warnings, motion_warnings, unlike, velocities_judged
 from imutool.log_info.report import Convention, TruthInfo
 from imutool.mcap_io.log import Log
-from imutool.recording import Imu, Recording
+from imutool.recording import GRAVITY_M_S2, Imu, Recording
 
 logger = logging.getLogger(__name__)
 
@@ -34,6 +34,7 @@ CONVERTIBLE = {  # messages of which `convert` makes others
 }
 QUATERNIONS = "quaternions of poses"  # said only where they are misread
 START_LATE_S = 0.015  # half of what is a warning; a start from poses 10 ms late is off by about its standard deviation
+LEAST_VERTICAL = 0.85  # of gravity along the z of the poses, in the mean: 32 degrees
 NO_POSES = "the log has no true poses"
 NO_TURN = (
     "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or poses of another motion"
@@ -80,12 +81,31 @@ def _warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
     if not found.motion.samples:
         return []
     warnings = [*found.constant_sensors(), *convention_warnings(whole)]
-    turns = None if whole.truth is None or warnings else found.turns[whole.truth.topic].agreement()
+    return warnings or _pose_warnings(found, whole) or lean_warnings(found, whole)
+
+
+def _pose_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
+    """Warnings of poses that do not turn as the gyro does."""
+    turns = None if whole.truth is None else found.turns[whole.truth.topic].agreement()
     if whole.truth is None or turns is None:
-        return warnings
+        return []
     topic, turned_deg = whole.truth.topic, [] if turns.turned is None else turns.turned.deg.tolist()
     seen = turns.explained, turns.rms_rad_s, turns.jumps, turns.largest_jump_deg
     return [*body_warnings(topic, turned_deg), *motion_warnings(topic, *seen)]
+
+
+def lean_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
+    """Warning of an IMU that lies otherwise than the body of the poses.
+
+    It comes where no other warning names the cause. Turns about one axis, as of wheels, do not show how it lies; gravity does.
+    """
+    truth, vertical = whole.truth, whole.conventions.vertical_m_s2
+    if truth is None or vertical is None or vertical > LEAST_VERTICAL * GRAVITY_M_S2 or _pose_warnings(found, whole):
+        return []
+    causes = "the IMU lies otherwise than their body, their world is not z up, or gravity was subtracted"
+    return [
+        f"the accelerometer reads {vertical:.1f} m/s² along the z of the poses {truth.topic} in the mean, not gravity: {causes}"
+    ]
 
 
 def check_start_poses(recording: Recording) -> float:
@@ -105,7 +125,8 @@ def check_start_poses(recording: Recording) -> float:
                 warning.removesuffix(f"; {CORRECTION}"),
                 where=f"{recording.name} {recording.imu_topic}",
                 expected="poses and samples of one motion for a start from the truth",
-                fix=f"{CORRECTION if warning.endswith(CORRECTION) else 'See imutool info LOG'}, or give another `init`",
+                fix=f"{_correction(warning, truth) if warning.endswith(CORRECTION) else 'See imutool info LOG'},"
+                " or give another `init`",
             )
     delay = whole.conventions.delay
     clear = delay is not None and delay.step is None and abs(delay.seconds) > max(START_LATE_S, LATE_STDS * delay.std_s)
@@ -124,7 +145,7 @@ def check_poses(recording: Recording, *, world: bool = True) -> None:
     for finding in Axes().findings(whole):
         if "poses" in finding.values and (world or whole.quaternions or whole.position_unit != "m"):
             expected = "quaternions as w, x, y, z from body to world, z up, and metres"
-            raise DataError(finding.what, where=recording.name, expected=expected, fix=CORRECTION)
+            raise DataError(finding.what, where=recording.name, expected=expected, fix=_correction(finding.what, truth))
     for warning in _warnings(motion, whole):
         logger.warning("%s: %s", recording.name, warning)
 
@@ -134,8 +155,15 @@ def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> TopicSumma
     motion = motion_of(imu, truth)
     whole = motion.summary(truth)
     for warning in [*_warnings(motion, whole), *defect_warnings(imu, whole)]:
-        logger.warning("%s: %s", where, warning)
+        logger.warning("%s: %s", where, warning.replace(CORRECTION, _correction(warning, truth)))
     return whole
+
+
+def _correction(warning: str, truth: Truth | None) -> str:
+    """The command that corrects what a warning names; poses that are no truth are judged only if they are called one."""
+    if truth is None or truth.kind == "truth" or "poses" not in warning:
+        return CORRECTION
+    return CORRECTION.replace("--fix", f"--fix --kind {truth.topic}=truth")
 
 
 def check_one_sensor(recordings: Sequence[Recording]) -> None:
@@ -179,7 +207,8 @@ def check_motion(motion: ImuMotion, truth: Truth | None, where: str) -> None:
     for warning in _warnings(motion, motion.summary(truth)):
         if warning.endswith(CORRECTION):
             what = warning.removesuffix(f"; {CORRECTION}")
-            raise DataError(what, where=where, expected="units, axes and poses that agree", fix=CORRECTION)
+            expected = "units, axes and poses that agree"
+            raise DataError(what, where=where, expected=expected, fix=_correction(warning, truth))
         logger.warning("%s: %s", where, warning)
 
 

@@ -24,6 +24,7 @@ from imutool.log_info.convention_report import (
     QUATERNIONS,
     convention_warnings,
     conventions,
+    lean_warnings,
     made_by_convert,
     truth_warnings,
 )
@@ -156,6 +157,7 @@ def _imu(
     used, others = _times(topic)
     found = conventions(whole) if len(imu) else []
     of_motion = [*motion.constant_sensors(), *convention_warnings(whole)] if len(imu) else ["no samples"]
+    of_motion = of_motion or lean_warnings(motion, whole)
     misread = any(entry.subject == QUATERNIONS for entry in found)  # such poses turn as no body does
     return ImuInfo(
         topic=topic.name,

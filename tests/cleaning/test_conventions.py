@@ -369,8 +369,22 @@ def test_wheel_odometry_of_another_frame_is_no_evidence() -> None:
     truth = of_poses("/odom", poses)
     assert truth is not None
     found = judge(motion_of(swapped), truth._replace(kind="unknown"), 1.0)
-    assert found == Conventions(topic="/odom", up=found.up, accel=found.accel, delay=found.delay)
+    assert found.vertical_m_s2 == pytest.approx(GRAVITY_M_S2, abs=0.1)
+    assert found == Conventions("/odom", accel=found.accel, up=found.up, delay=found.delay, vertical_m_s2=found.vertical_m_s2)
     assert found.up in (None, "+z")
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_inverse_quaternions_are_seen_though_those_as_recorded_share_the_yaw(seed: int) -> None:
+    """A drone whose IMU lies on its back: the inverse yaws as its gyro does, and leaves no sure order of the axes."""
+    imu, poses = turned(waves(60.0, (0.08, 0.08, 0.45), seed), waves(60.0, (1.0, 1.0, 0.3), 4), noise=0.02)
+    back = Imu(imu.t_ns, imu.gyro * [1.0, -1.0, -1.0], imu.accel * [1.0, -1.0, -1.0])
+    truth = of_poses("/mocap", poses)
+    assert truth is not None
+    found = judge(motion_of(back), truth._replace(q_wb_wxyz=truth.q_wb_wxyz * [1.0, -1.0, -1.0, -1.0]), 1.0)
+    assert found.quaternions == "are the inverse: they take vectors of the world to the body"
+    assert found.gyro is not None
+    np.testing.assert_array_equal(found.gyro.axes, np.diag([1.0, -1.0, -1.0]))
 
 
 def test_level_flight_is_no_evidence_without_poses() -> None:

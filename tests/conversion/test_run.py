@@ -453,3 +453,23 @@ def test_an_acquisition_of_st_is_named(tmp_path: Path) -> None:
     (tmp_path / "run/device_config.json").write_text('{"devices": []}')
     with pytest.raises(DataError, match=r"an acquisition of ST's High Speed Datalog.*Export it as CSV"):
         convert(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.parametrize("jumps", [False, True])
+def test_a_topic_on_a_clock_of_its_own_is_no_jump_of_the_clock(tmp_path: Path, jumps: bool, imutool) -> None:
+    """As GNSS beside an IMU, in seconds of the week and since the start."""
+    t_s, vectors = np.arange(300) / 100.0, np.random.default_rng(5).normal([0, 0, 0, 0, 0, 9.81], 0.1, (300, 6))
+    t_s[150:] += 7200.0 * jumps
+    (tmp_path / "drive").mkdir()
+    names = ["t [s]", *(f"g{a} [rad/s]" for a in "xyz"), *(f"a{a} [m/s^2]" for a in "xyz")]
+    write_csv(tmp_path / "drive/imu.csv", names, [t_s, *vectors.T])
+    write_csv(tmp_path / "drive/gps.csv", ["tow [s]", "lat", "lon"], [511_000.0 + t_s[:150:10], t_s[:150:10], t_s[:150:10]])
+    convert(tmp_path / "drive", tmp_path / "log.mcap")
+    with Log(tmp_path / "log.mcap") as log:
+        assert {"/imu0", "/gps_lat"} <= {*log.topics}
+    done = imutool("convert", "log.mcap", "fixed.mcap", "--fix", cwd=tmp_path)
+    assert done.returncode == 0
+    told = [line for line in done.stderr.splitlines() if "the clock jumps by +7200.01 s" in line]
+    assert len(told) == jumps
+    assert "other" not in "".join(told)
+    assert done.stderr.count("the clock jumps") == jumps

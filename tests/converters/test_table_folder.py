@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.io
 from scipy.spatial.transform import Rotation
+from support.tables import write_csv
 
 from imutool.conversion.run import convert
 from imutool.converters import sensor_tables, table
@@ -484,3 +485,26 @@ def test_pairs_that_last_differently_are_recordings_of_their_own(tmp_path):
         (tmp_path / f"walk_f_1_{sensor}.csv").write_text("time,X_value,Y_value,Z_value\n" + rows(t_s, each))
     (together,) = table.sequences(tmp_path)
     assert len(table.read_sequence(together, mapping={"gyro_unit": "rad/s"}).imus) == 2
+
+
+def test_a_narrow_table_beside_an_imu_keeps_its_readings(tmp_path):
+    t_s, vectors = np.arange(300) / 100.0, np.random.default_rng(5).normal([0, 0, 0, 0, 0, 9.81], 0.1, (300, 6))
+    names = ["t [s]", *(f"g{a} [rad/s]" for a in "xyz"), *(f"a{a} [m/s^2]" for a in "xyz")]
+    write_csv(tmp_path / "imu.csv", names, [t_s, *vectors.T])
+    write_csv(tmp_path / "baro.csv", ["t [s]", "pressure"], [t_s[::10], 1e5 + t_s[::10]])
+    (sequence,) = table.sequences(tmp_path)
+    log = table.read_sequence(sequence)
+    assert [*log.imus] == ["/imu0"]
+    assert len(log.scalars["/baro_pressure"].t_ns) == 30
+
+
+def test_tables_of_a_folder_that_show_no_imu_are_named(tmp_path, caplog):
+    """As those of a device whose columns have no known names, beside one that is read."""
+    names = ["t [s]", *(f"g{a} [rad/s]" for a in "xyz"), *(f"a{a} [m/s^2]" for a in "xyz")]
+    for name in ("walk", "run"):
+        write_csv(tmp_path / f"{name}.csv", names, [T_S, *GYRO.T, *ACCEL.T])
+    write_csv(tmp_path / "other.csv", ["p", "q", "r", "s"], [RNG.normal(0.0, 1.0, COUNT) for _ in range(4)])
+    (tmp_path / "settings.json").write_text('{"gain": [1, 2, 3], "rate": 5}')
+    assert [sequence.name for sequence in table.sequences(tmp_path)] == ["run", "walk"]
+    (told,) = [line.getMessage() for line in caplog.records]
+    assert told == f"{tmp_path}: tables that show no IMU are left out: other.csv"

@@ -103,6 +103,18 @@ def test_rows_of_several_kinds_do_not_hide_one_another(tmp_path):
     np.testing.assert_allclose(np.hstack([imu.gyro, imu.accel]), np.hstack([GYRO, ACCEL]))
 
 
+def test_rows_of_several_kinds_that_a_spreadsheet_made_equally_long_are_told_apart(tmp_path):
+    """Quaternions of a sensor beside its readings, with the commas that a spreadsheet adds."""
+    lines = []
+    for number, (gyro, accel) in enumerate(zip(GYRO.tolist(), ACCEL.tolist(), strict=True)):
+        lines += [row(",", 10 * number, 2, *accel, *gyro), row(",", 10 * number, 3, 1.0, 0.0, 0.0, 0.0, "", "")]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    mapping = {"gyro_unit": "rad/s", "time_unit": "ms"}
+    imu = table.read_sequence(table.sequences(tmp_path / "log.csv")[0], mapping=mapping).imus["/imu0"]
+    np.testing.assert_allclose(np.hstack([imu.gyro, imu.accel]), np.hstack([GYRO, ACCEL]))
+    assert np.array_equal(imu.t_ns, 10_000_000 * np.arange(COUNT))
+
+
 @pytest.mark.parametrize("flags", ["VX", ("true", "false"), ("walk", "run")])
 def test_states_and_labels_of_one_device_make_no_kinds_of_rows(tmp_path, flags):
     lines = ["time [ms],state,gx [deg/s],gy [deg/s],gz [deg/s],ax [g],ay [g],az [g]"]

@@ -65,3 +65,34 @@ def test_a_clock_of_batches_that_is_set_back_loses_what_it_repeats(tmp_path: Pat
     assert len(imu) == COUNT - 200
     assert np.diff(imu.t_ns).min() > 0
     assert "/imu0: 200 samples whose stamp goes back are left out" in log.remarks.notes
+
+
+@pytest.mark.parametrize("form", ["150405.12", "150405120", "150405"])
+def test_numbers_of_hours_minutes_and_seconds_are_a_time_of_the_day(tmp_path: Path, form: str) -> None:
+    """As milliseconds or seconds they jump by 40 s where a minute ends, and by 40 minutes where an hour ends."""
+    rate_hz = 5 if form == "150405" else 100
+    t_s = 15 * 3600 + 59 * 60 + 55 + np.arange(COUNT) / rate_hz
+    hhmmss = t_s // 3600 * 10_000 + t_s // 60 % 60 * 100 + t_s % 60
+    stamps = {"150405": np.floor(hhmmss + 1e-9), "150405120": np.rint(hhmmss * 1000)}.get(form, np.round(hhmmss, 2))
+    stamps = stamps if "." in form else stamps.astype(np.int64)
+    (tmp_path / "log.csv").write_text("\n".join(["utc_time,gx,gy,gz,ax,ay,az", *lines(stamps, GYRO, ACCEL)]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path)[0], mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_allclose(log.imus["/imu0"].t_ns, np.rint(t_s * 1e9), atol=1e3)
+    assert "'utc_time' holds hours, minutes and seconds (hhmmss), from the start of the day" in log.remarks.notes
+
+
+@pytest.mark.parametrize(("step", "rows"), [(50, 100), (50, 101), (20, 1000), (1000, 300)])
+def test_milliseconds_are_no_hours_minutes_and_seconds(tmp_path: Path, step: int, rows: int) -> None:
+    stamps = step * np.arange(rows)
+    (tmp_path / "log.csv").write_text("\n".join(["time,gx,gy,gz,ax,ay,az", *lines(stamps, GYRO[:rows], ACCEL[:rows])]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path)[0], mapping={"gyro_unit": "rad/s", "time_unit": "ms"})
+    assert np.array_equal(log.imus["/imu0"].t_ns, stamps * 1_000_000)
+
+
+def test_a_time_that_only_rises_has_a_stamp_for_each_row(tmp_path: Path) -> None:
+    """Beside the time of a program that stands still for batches it is taken, and nothing is said of batches."""
+    rows = lines(STAMPS_MS + 10**12, T_NS[:, None] // 1_000_000 + 1_700_000_000_000, GYRO, ACCEL)
+    (tmp_path / "log.csv").write_text("\n".join(["time,millis,gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path)[0], mapping={"gyro_unit": "rad/s"})
+    assert np.array_equal(log.imus["/imu0"].t_ns, T_NS + 1_700_000_000_000_000_000)
+    assert not any("has a stamp for" in note for note in log.remarks.notes)

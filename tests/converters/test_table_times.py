@@ -313,11 +313,26 @@ def test_a_table_without_any_time_is_read_by_a_map_with_a_rate(tmp_path):
     path = write_csv(tmp_path / "bare.csv", names, [*ACCEL.T, *GYRO.T])
     with pytest.raises(ConfigError, match="no column that rises looks like a time") as refused:
         read(path)
-    assert "# without a column of times: rate_hz = 100.0" in refused.value.fix
+    assert "# without a column of times: rate_hz = SAMPLES_A_SECOND" in refused.value.fix
     entries = refused.value.fix.split("\n\n", 1)[1].splitlines()
     kept = [line for line in entries if not line.startswith("time")]
     (tmp_path / "map.toml").write_text("\n".join([*kept, "rate_hz = 250"]))
     assert np.array_equal(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns, NEXT_NS * np.arange(COUNT))
+
+
+@pytest.mark.parametrize("every", [1, 3, 0])
+def test_a_rate_alone_keeps_the_gaps_that_a_counter_shows(tmp_path, every):
+    """The message that asks for the rate proposes the counter, and `--map rate_hz=250` does not undo that.
+
+    Numbers that jump by one and two count no samples.
+    """
+    names = ["n_samples", *(f"acc_{a}" for a in "xyz"), *(f"gyr_{a} [rad/s]" for a in "xyz")]
+    rows = np.delete(np.arange(COUNT), [70, 71, 72]) if every else np.arange(COUNT)
+    counter = every * np.arange(COUNT) if every else np.cumsum(1 + np.arange(COUNT) % 2)
+    path = write_csv(tmp_path / "counted.csv", names, [counter[rows], *ACCEL[rows].T, *GYRO[rows].T])
+    log = read(path, {"rate_hz": 250.0})
+    assert np.array_equal(log.imus["/imu0"].t_ns, NEXT_NS * rows)
+    assert ("'n_samples' counts the samples: rate_hz is that of its steps" in log.remarks.notes) == bool(every)
 
 
 @pytest.mark.parametrize("wrong", ["rate_hz = -5\n", 'rate_hz = 100\ntime = "t"\ntime_unit = "s"\n'])

@@ -192,6 +192,17 @@ def test_sentences_of_a_vectornav_lack_a_time_alone(tmp_path, sentence):
     np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, atol=1e-4)
 
 
+def test_the_fields_of_a_microstrain_sensor_have_the_units_of_its_protocol(tmp_path):
+    """In g at rest the acceleration shows its unit, but a gyro in rad/s shows none."""
+    names = ["GPS Week", "GPS TOW", *(f"{a} Accel [x8004]" for a in "XYZ"), *(f"{a} Gyro [x8005]" for a in "XYZ")]
+    gyro = RNG.normal(0.0, 0.1, (COUNT, 3))
+    above = "FILE_INFO\nListSeparator=comma\n\nDEVICE_INFO\nModelName,3DM-GX3-35\n\nDATA_START\n"
+    columns = [np.full(COUNT, 1969), 137_649.0 + T_S, *ACCEL_G.T, *gyro.T]
+    imu = read(write_csv(tmp_path / "log.csv", names, columns, above=above)).imus["/imu0"]
+    np.testing.assert_array_equal(imu.gyro, gyro)
+    np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G)
+
+
 def test_the_scales_of_a_log_of_gyroflow_are_applied(tmp_path):
     stated = (
         "GYROFLOW IMU LOG\nversion,1.3\nid,logger\norientation,YxZ\ntscale,0.001\ngscale,0.00122173047\nascale,0.00048828125\n"

@@ -16,13 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from imutool.api.logs import export
 from imutool.api.models import debias as debias_recording
+from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.diagnosis.diagnose import diagnose
 from imutool.errors import DataError, ImutoolError, ModelError
 from imutool.evaluation import evaluate
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.write import write
-from imutool.recording import Imu, Recording
+from imutool.recording import Imu, Poses, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.sensor.simulate import simulate
 from imutool.training.run import train
@@ -198,6 +199,45 @@ def test_positions_of_another_world_or_unit_are_not_scored(
     assert found["aoe_deg"] > 0.0
     figures = [found[name] for name in ("ape_m", "velocity_rmse_m_s", "drift_velocity_m_s")]
     assert [figure is not None for figure in figures] == 3 * [scored]
+
+
+@pytest.mark.parametrize(("axes", "told"), [(np.eye(3), False), (np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), True)])
+def test_gravity_shows_an_imu_that_lies_otherwise_than_a_robot_on_a_floor(
+    axes: np.ndarray, told: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Turns about one axis do not, and odometry is no evidence of axes: as on a Husky whose IMU has its y up."""
+    t_s, rng = np.arange(3000) / 100.0, np.random.default_rng(4)
+    yaw, rate = np.sin(0.7 * t_s), 0.7 * np.cos(0.7 * t_s)
+    v_w = np.stack([np.cos(yaw), np.sin(yaw), 0.0 * t_s], axis=1)
+    p_wb, q_wb = np.cumsum(v_w, axis=0) / 100.0, Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0])
+    rates = np.stack([0.0 * t_s, 0.0 * t_s, rate], axis=1)
+    force = np.stack([0.0 * t_s, rate, 9.81 + 0.0 * t_s], axis=1)  # centripetal at 1 m/s
+    gyro, accel = ((each + rng.normal(0.0, 1e-2, (3000, 3))) @ axes.T for each in (rates, force))
+    t_ns = np.rint(t_s * 1e9).astype(np.int64)
+    poses = Poses(t_ns[::5], p_wb[::5], q_wb.as_quat(scalar_first=True)[::5])
+    topic = "/ground_truth/pose"
+    write(Recording("log", Imu(t_ns, gyro, accel), {topic: poses}), tmp_path / "true.mcap")
+    convert(tmp_path / "true.mcap", tmp_path / "log.mcap", kinds=[f"{topic}=odometry"])
+    evaluate(tmp_path / "log.mcap", truth=topic)
+    said = [line.getMessage() for line in caplog.records if "along the z of the poses" in line.getMessage()]
+    assert len(said) == told
+
+
+def test_the_command_that_corrects_estimated_poses_calls_them_true(
+    made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """`convert --fix` alone judges no poses of another kind."""
+    topic, log, fixed = "/ground_truth/pose", tmp_path / "log.mcap", tmp_path / "fixed.mcap"
+    write(in_ned(made), tmp_path / "true.mcap")
+    convert(tmp_path / "true.mcap", log, kinds=[f"{topic}=estimate"])
+    evaluate(log, truth=topic)
+    (told,) = [line.getMessage() for line in caplog.records if "has -z up" in line.getMessage()]
+    assert told.endswith(f"imutool convert LOG OUT --fix --kind {topic}=truth corrects it")
+    convert(log, fixed, kinds=[f"{topic}=truth"], correct=["conventions"])
+    caplog.clear()
+    (found,) = evaluate(fixed, truth=topic)
+    assert found["ape_m"] is not None
+    assert not caplog.records
 
 
 def test_a_log_as_it_should_be_brings_no_warning(made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
