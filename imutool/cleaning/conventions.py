@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -73,8 +74,9 @@ def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventio
         carried = relative
         if relative is None and gyro is not None and gyro.wrong and gyro.sole:
             carried = _against_gravity(step, mean, gyro.axes)
-        accel, up, unit, other = _accel_against_poses(step, force, motion.middle_ns, poses, gyro, carried)
-        vertical = _mean_vertical(step, force, motion.middle_ns, poses)
+        forces = _force_at_poses(step, force, motion.middle_ns, poses)
+        accel, up, unit, other = _accel_against_poses(forces, gyro, carried)
+        vertical = _mean_vertical(forces)
         found.append(Conventions(truth.topic, gyro, accel, carried, up, delay, unit, what or other, vertical))
     return max(found, key=lambda each: (each.up == "+z", each.accel is not None))  # of equals the first
 
@@ -223,39 +225,37 @@ def _nearest(choice: Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "
     return _reading(choice._replace(best=nearest), readings)._replace(sole=False)
 
 
-def _force_at_poses(
-    step: Int64[np.ndarray, " m"], accel: Float64[np.ndarray, "m 3"], start_ns: int, truth: Truth
-) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 4"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+class _Forces(NamedTuple):
     """Times of the poses that have samples, their orientation and acceleration, and the specific force there."""
+
+    t_s: Float64[np.ndarray, " n"]
+    q_wb: Float64[np.ndarray, "n 4"]
+    a_w: Float64[np.ndarray, "n 3"]
+    f: Float64[np.ndarray, "n 3"]
+
+
+def _force_at_poses(step: Int64[np.ndarray, " m"], accel: Float64[np.ndarray, "m 3"], start_ns: int, truth: Truth) -> _Forces:
     at_ns, q_wb, a_w = force_in_world(truth)
     use, first_s, _ = usable(at_ns, at_ns + 1, start_ns, step)
     f = np.stack([np.interp(first_s, STEP_S * (step + 0.5), column) for column in accel.T], axis=1)
-    return first_s, q_wb[use], a_w[use], f
+    return _Forces(first_s, q_wb[use], a_w[use], f)
 
 
-def _mean_vertical(
-    step: Int64[np.ndarray, " m"], accel: Float64[np.ndarray, "m 3"], start_ns: int, truth: Truth
-) -> float | None:
+def _mean_vertical(forces: _Forces) -> float | None:
     """Mean specific force along the z of the poses; their own acceleration has no mean worth naming over `LEAST_MEAN_S`."""
-    first_s, q_wb, _, f = _force_at_poses(step, accel, start_ns, truth)
-    if not len(f) or first_s[-1] - first_s[0] < LEAST_MEAN_S:
+    if not len(forces.f) or forces.t_s[-1] - forces.t_s[0] < LEAST_MEAN_S:
         return None
-    return float(quaternion.rotate(q_wb, f)[:, 2].mean())
+    return float(quaternion.rotate(forces.q_wb, forces.f)[:, 2].mean())
 
 
 def _accel_against_poses(
-    step: Int64[np.ndarray, " m"],
-    accel: Float64[np.ndarray, "m 3"],
-    start_ns: int,
-    truth: Truth,
-    gyro: Reading | None,
-    relative: Reading | None,
+    forces: _Forces, gyro: Reading | None, relative: Reading | None
 ) -> tuple[Reading | None, str | None, str, str]:
     """Axes of the accelerometer by the poses, their axis that is up, unit of positions, and `OTHER_WORLD` or nothing.
 
     a_w + g up = R_wb axes f. Without acceleration, or in noise, (axes, up) and (-axes, -up) fit alike: the up of right axes.
     """
-    first_s, q_wb, a_w, f = _force_at_poses(step, accel, start_ns, truth)
+    first_s, q_wb, a_w, f = forces
     if len(f) < FEWEST_BLOCKS:
         return None, None, "m", ""
     ups = np.concatenate([np.eye(3)[2:], -np.eye(3)[2:], np.eye(3)[:2], -np.eye(3)[:2]])
