@@ -482,6 +482,17 @@ def test_a_misspelt_option_of_view_is_named_before_any_work() -> None:
         imutool.view("absent.mcap", model="static")
 
 
+def test_convert_corrects_a_log_on_demand_as_the_command_does(tmp_path: Path) -> None:
+    made = imutool.example_recording(3, duration_s=20.0)
+    late = np.random.default_rng(0).integers(0, 3_000_000, len(made.imu))
+    in_g = imutool.Imu(made.imu.t_ns + late, made.imu.gyro, made.imu.accel / 9.80665)
+    imutool.write(tmp_path / "wrong.mcap", replace(made, imu=in_g))
+    imutool.convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", fix=True, restamp=True)
+    right = imutool.read(tmp_path / "right.mcap").imu
+    np.testing.assert_allclose(right.accel, made.imu.accel, atol=1e-9)
+    assert np.ptp(np.diff(right.t_ns)) < 1e5
+
+
 def test_a_report_prints_as_the_json_of_its_command(tmp_path: Path) -> None:
     imutool.write(tmp_path / "log.mcap", STILL)
     report = imutool.info(tmp_path / "log.mcap")

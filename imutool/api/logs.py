@@ -116,7 +116,8 @@ def convert(
     kinds: str | Sequence[str] = (),
     mapping: str | Path | Mapping[str, Any] | None = None,
     imu: str = "",
-    correct: str | Sequence[str] = (),
+    fix: bool = False,
+    restamp: bool = False,
     workers: int | None = None,
     progress: NamedProgress | None = None,
 ) -> ConvertReport:
@@ -134,7 +135,8 @@ def convert(
         kinds: Kind of the poses by topic, as `TOPIC=truth|estimate|odometry|unknown`.
         mapping: Meaning and units of a table's columns: a TOML file, or entries of one such as `{"gyro_unit": "deg/s"}`.
         imu: Two topics that become one IMU: `gyro=TOPIC,accel=TOPIC`.
-        correct: `conventions`: wrong units, axes and frames, as the motion shows; `stamps`: late stamps of the IMU.
+        fix: Correct units, axes and frames that the motion shows to be wrong.
+        restamp: Put late stamps on the clock of the IMU.
         workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
         progress: Callback with sequences done, sequences in all, and the name of the last one.
 
@@ -147,21 +149,17 @@ def convert(
         ['flight_1.mcap', 'flight_2.mcap']
     """
     check_outputs([OutputFile("out", out, files=("*.mcap",), keeps=True)], [source], overwrite=overwrite)
+    ways: dict[str, Any] = {"compression": compression, "images": images, "overwrite": overwrite, "workers": workers}
+    marks: dict[str, Any] = {"sensor": sensor, "kinds": several(kinds), "imu": imu, "fix": fix, "restamp": restamp}
     return conversion.convert(
         local(source, "source"),
         f"{local(out, 'out')}/" if str(out).endswith("/") else local(out, "out"),
         format=format,
         sequences=several(sequences),
-        compression=compression,
-        images=images,
-        overwrite=overwrite,
-        sensor=sensor,
-        kinds=several(kinds),
         mapping=mapping if mapping is None or isinstance(mapping, Mapping) else local(mapping, "mapping"),
-        imu=imu,
-        correct=several(correct),
-        workers=workers,
         progress=progress,
+        **ways,
+        **marks,
     )
 
 

@@ -95,7 +95,8 @@ def convert(
             kinds=kind or (),
             mapping=_mapping(map_ or []),
             imu=imu,
-            correct=[name for name, asked in (("conventions", fix), ("stamps", restamp)) if asked],
+            fix=fix,
+            restamp=restamp,
             workers=workers,
             progress=tell,
         )

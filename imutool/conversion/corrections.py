@@ -20,7 +20,7 @@ from imutool.cleaning.likelihood import axis_names
 from imutool.cleaning.pose_quaternions import read_right
 from imutool.cleaning.position_unit import POSITIONS
 from imutool.conversion.restamping import SAME_CLOCK_NS
-from imutool.errors import ConfigError, DataError
+from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.log_info.pose_imu_rotation import Body
 from imutool.mcap_io.codec import schemas
@@ -247,15 +247,3 @@ def _is_pose(topic: MessageTopic) -> bool:
     """Whether a topic holds poses, or their velocities."""
     name = schemas.canonical(topic.schema_name)
     return name in (*MESSAGE_POSES, schemas.TF) or (name == schemas.VECTOR3 and VELOCITY_KEY in dict(topic.metadata))
-
-
-def parse_corrections(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of corrections.
-
-    Raises:
-        ConfigError: another name.
-    """
-    for name in names:
-        if name not in (CONVENTIONS, STAMPS):
-            raise ConfigError(f"{name!r}", where="correct", expected=f"{CONVENTIONS} or {STAMPS}")
-    return tuple(names)

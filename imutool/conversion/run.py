@@ -16,7 +16,7 @@ from typing import Any
 
 from imutool import registry
 from imutool.conversion import Failure
-from imutool.conversion.corrections import parse_corrections
+from imutool.conversion.corrections import CONVENTIONS, STAMPS
 from imutool.conversion.unread_formats import nothing_found
 from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, ConvertReport, Job, Progress, run_jobs, write_content
@@ -64,7 +64,8 @@ def convert(
     kinds: Sequence[str] = (),
     mapping: Path | Mapping[str, Any] | None = None,
     imu: str = "",
-    correct: Sequence[str] = (),
+    fix: bool = False,
+    restamp: bool = False,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> ConvertReport:
@@ -73,15 +74,16 @@ def convert(
     `sensor` names the IMU where the data set does not, and `kinds` (`TOPIC=truth|estimate|odometry|unknown`) says what poses
     are worth. `mapping` (a file, or its entries) states what a table's columns mean. `out` with a slash at its end is a folder.
     `imu` (`gyro=TOPIC,accel=TOPIC`) joins two sensors to one IMU; pairs that differ in name by the sensor alone join unasked.
-    `correct` names what is corrected: `conventions` that the log's motion shows to be wrong, and `stamps`.
+    `fix` corrects units, axes and frames that the log's motion shows to be wrong, `restamp` late stamps.
     `workers` is the number of processes, by default one a processor; with 1, or for one sequence, all happens here.
 
     Raises:
         DataError: no converter recognises anything in the source.
-        ConfigError: unknown format, sequence or correction, two of one name, a target that exists or cannot be made.
+        ConfigError: unknown format or sequence, two of one name, a target that exists or cannot be made.
         ImutoolError: the only sequence there is (or was asked for) failed; of several, failures go to the report.
     """
-    labels, corrected = Labels(sensor, parse_kinds(kinds), parse_pair(imu)), parse_corrections(correct)
+    labels = Labels(sensor, parse_kinds(kinds), parse_pair(imu))
+    corrected = (*[CONVENTIONS] * fix, *[STAMPS] * restamp)
     ways = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
         return _from_stream(module, source, out, sequences, ways, progress)
@@ -157,7 +159,7 @@ def _find(source: Path, format: str, out: Path) -> _Sequences:
                     errors.setdefault(str(sequence), (sequence.name, reason))
             except ImutoolError as error:
                 errors[str(sequence)] = (sequence.name, error)
-    if not claims and source.is_dir():  # logs of its own are sources where nothing else is, as for `correct`
+    if not claims and source.is_dir():  # logs of its own are sources where nothing else is, as for `fix`
         found = ((key, m.own_logs(source)) for key, m in _converters(format) if hasattr(m, "own_logs"))
         apart = ((key, log) for key, own in found for log in own if not log.path.resolve().is_relative_to(out.resolve()))
         claims = {str(log): [Job(key, log)] for key, log in apart}

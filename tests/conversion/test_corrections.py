@@ -62,7 +62,7 @@ def test_a_log_in_g_and_degrees_permuted_in_ned_comes_back(accel_axes: np.ndarra
     write(replace(made, imu=wrong, truths={k: in_ned(v) for k, v in made.truths.items()}), tmp_path / "wrong.mcap")
     before = (tmp_path / "wrong.mcap").read_bytes()
     assert [w for w in inspect(tmp_path / "wrong.mcap").warnings if "--fix" in w]
-    report = convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    report = convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", fix=True)
     fixed = read(tmp_path / "right.mcap")
     alike = (accel_axes == P).all()  # then the sensor keeps its axes, and the body of the poses is turned to it
     np.testing.assert_allclose(fixed.imu.gyro @ (P if alike else np.eye(3)), made.imu.gyro, rtol=0, atol=1e-13)
@@ -88,7 +88,7 @@ def test_positions_in_other_units_come_back_in_metres(scale: float, made: Record
     write(replace(made, truths={"/ground_truth/pose": large, "/ground_truth_leica/pose": other}), tmp_path / "large.mcap")
     (warning,) = inspect(tmp_path / "large.mcap").warnings
     assert f"are in {'mm' if scale > 100 else 'cm'} and not in m" in warning
-    convert(tmp_path / "large.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    convert(tmp_path / "large.mcap", tmp_path / "right.mcap", fix=True)
     fixed = read(tmp_path / "right.mcap")
     np.testing.assert_allclose(fixed.truth.p_wb, made.truth.p_wb, rtol=1e-12)
     if made.truth.v_w is not None:
@@ -107,7 +107,7 @@ def test_a_turned_body_of_the_poses_comes_back_to_the_imu(made: Recording, tmp_p
     true = Rotation.from_quat(made.truth.q_wb_wxyz.copy(), scalar_first=True)
     askew = replace(made.truth, q_wb_wxyz=(true * turn).as_quat(scalar_first=True))
     write(replace(made, truths={"/ground_truth/pose": askew}), tmp_path / "askew.mcap")
-    report = convert(tmp_path / "askew.mcap", tmp_path / "straight.mcap", correct=["conventions"])
+    report = convert(tmp_path / "askew.mcap", tmp_path / "straight.mcap", fix=True)
     fixed = read(tmp_path / "straight.mcap")
     left = Rotation.from_quat(fixed.truth.q_wb_wxyz.copy(), scalar_first=True) * true.inv()
     assert np.degrees(left.magnitude()).max() < 1.0  # the sensor's own misalignment is of that size
@@ -126,7 +126,7 @@ def test_quaternions_in_ned_beside_positions_in_enu_come_back(made: Recording, t
     (warning,) = inspect(tmp_path / "wrong.mcap").warnings
     assert OTHER_WORLD in warning
     assert evaluate(tmp_path / "wrong.mcap")[0]["ape_m"] is None
-    convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", fix=True)
     assert_comes_back(tmp_path / "right.mcap", made)
 
 
@@ -142,7 +142,7 @@ def test_misread_quaternions_come_back_and_what_they_hid_too(what: str, made: Re
     assert len(warnings) == 1  # and not that the poses turn unlike the gyro, which follows from it
     assert what in warnings[0]
     assert "--fix" in warnings[0]
-    convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", fix=True)
     assert_comes_back(tmp_path / "right.mcap", made)
     q_wxyz = read(tmp_path / "right.mcap").truth.q_wb_wxyz
     with Log(tmp_path / "right.mcap") as log:
@@ -161,7 +161,7 @@ def test_late_poses_of_a_turned_body_in_another_world_are_corrected_at_once(tmp_
     q_wxyz = (y_up * true * turn).as_quat(scalar_first=True)
     late = Poses(made.truth.t_ns + round(late_s * 1e9), made.truth.p_wb @ y_up.as_matrix().T, q_wxyz)
     write(replace(made, truths={"/vicon/pose": late}), tmp_path / "late.mcap")
-    convert(tmp_path / "late.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    convert(tmp_path / "late.mcap", tmp_path / "right.mcap", fix=True)
     assert inspect(tmp_path / "right.mcap").warnings == []
     fixed = read(tmp_path / "right.mcap")
     assert np.abs(fixed.truth.t_ns - made.truth.t_ns).max() < 5_000_000
@@ -202,9 +202,9 @@ def test_short_logs_are_corrected_as_the_others_of_their_setup_and_a_right_one_s
             poses = Poses(poses.t_ns + 80_000_000, p_wb, q_wxyz.as_quat(scalar_first=True))
         part = replace(made, imu=made.imu.between(first_ns, last_ns), truths={"/vicon/pose": poses})
         write(part, tmp_path / "in" / f"{name}.mcap")
-    alone = convert(tmp_path / "in" / "short_1.mcap", tmp_path / "alone.mcap", correct=["conventions"])
+    alone = convert(tmp_path / "in" / "short_1.mcap", tmp_path / "alone.mcap", fix=True)
     assert not any("positions are now in m" in note for note in alone.notes)
-    report = convert(tmp_path / "in", tmp_path / "out", correct=["conventions"], workers=1)
+    report = convert(tmp_path / "in", tmp_path / "out", fix=True, workers=1)
     assert [note.partition(":")[0] for note in report.notes if "as in the other logs" in note] == [
         "short_1.mcap",
         "short_2.mcap",
@@ -237,7 +237,7 @@ def test_a_log_whose_poses_have_another_delay_does_not_get_that_of_the_others(tm
         poses = made.truth.between(*ends_ns)
         late = replace(poses, t_ns=poses.t_ns + late_ms * 1_000_000)
         write(replace(made, imu=made.imu.between(*ends_ns), truths={"/vicon/pose": late}), tmp_path / "in" / f"{name}.mcap")
-    notes = convert(tmp_path / "in", tmp_path / "out", correct=["conventions"], workers=1).notes
+    notes = convert(tmp_path / "in", tmp_path / "out", fix=True, workers=1).notes
     for name, (_, _, late_ms, is_corrected) in logs.items():
         before, after = (read(tmp_path / folder / f"{name}.mcap").truth.t_ns[0] for folder in ("in", "out"))
         if is_corrected:
@@ -270,7 +270,7 @@ def test_a_small_delay_does_not_turn_the_body(tmp_path: Path) -> None:
     for name, late_ns in (("late", 60_000_000), ("punctual", 0)):
         poses = Poses(made.truth.t_ns + late_ns, made.truth.p_wb, (true * turn).as_quat(scalar_first=True))
         write(replace(made, truths={"/vicon/pose": poses}), tmp_path / f"{name}.mcap")
-        convert(tmp_path / f"{name}.mcap", tmp_path / f"{name}_right.mcap", correct=["conventions"])
+        convert(tmp_path / f"{name}.mcap", tmp_path / f"{name}_right.mcap", fix=True)
     late, punctual = (
         Rotation.from_quat(read(tmp_path / f"{name}_right.mcap").truth.q_wb_wxyz.copy(), scalar_first=True)
         for name in ("late", "punctual")
@@ -302,7 +302,7 @@ def test_poses_of_another_frame_keep_their_clock(tmp_path: Path) -> None:
 
 def test_a_right_log_stays_as_it_is(made: Recording, tmp_path: Path) -> None:
     write(made, tmp_path / "made.mcap")
-    report = convert(tmp_path / "made.mcap", tmp_path / "same.mcap", correct=["conventions"])
+    report = convert(tmp_path / "made.mcap", tmp_path / "same.mcap", fix=True)
     assert read(tmp_path / "same.mcap").imu == made.imu
     assert report.notes == ["same.mcap: the motion shows nothing to correct"]
 
@@ -319,7 +319,7 @@ def test_a_log_at_rest_in_g_and_steps_of_a_register_comes_in_radians(
     forces = read_g * (np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, 1e-4, shape))
     write(Recording("still", Imu(made.imu.t_ns, dps, forces)), tmp_path / "still.mcap")
     assert any("gyro looks like deg/s" in warning for warning in inspect(tmp_path / "still.mcap").warnings)
-    report = convert(tmp_path / "still.mcap", tmp_path / "log.mcap", correct=["conventions"])
+    report = convert(tmp_path / "still.mcap", tmp_path / "log.mcap", fix=True)
     fixed = read(tmp_path / "log.mcap").imu
     np.testing.assert_allclose(fixed.gyro, np.deg2rad(dps), rtol=1e-9)
     np.testing.assert_allclose(fixed.accel, forces * (1.0 if kept else 9.80665), rtol=1e-9)
@@ -332,7 +332,7 @@ def test_batched_stamps_are_put_on_the_sensors_line(made: Recording, tmp_path: P
     write(replace(made, imu=bunched), tmp_path / "bunched.mcap")
     (warning,) = inspect(tmp_path / "bunched.mcap").warnings
     assert "batches of about 4.0" in warning
-    convert(tmp_path / "bunched.mcap", tmp_path / "even.mcap", correct=["stamps"])
+    convert(tmp_path / "bunched.mcap", tmp_path / "even.mcap", restamp=True)
     even = read(tmp_path / "even.mcap").imu
     assert np.abs(even.t_ns - made.imu.t_ns).max() < 100_000
     assert (even.gyro == made.imu.gyro).all()
@@ -364,7 +364,7 @@ def test_stamps_that_were_never_set_become_the_log_times(made: Recording, tmp_pa
     for run in (read, lambda path: debias_log(path, tmp_path / "debiased.mcap", model="static")):
         with pytest.raises(LogError, match="A stamp of 0 is not set: imutool convert LOG OUT --restamp"):
             run(tmp_path / "unset.mcap")
-    convert(tmp_path / "unset.mcap", tmp_path / "set.mcap", correct=["stamps"])
+    convert(tmp_path / "unset.mcap", tmp_path / "set.mcap", restamp=True)
     found = read(tmp_path / "set.mcap")
     assert np.abs(found.imu.t_ns - made.imu.t_ns).max() <= 1
     assert (found.truth.t_ns == made.truth.t_ns).all()
@@ -384,7 +384,7 @@ def test_a_counter_that_wraps_runs_on_for_the_imu_and_the_poses_alike(
         return (stamp_ns - wrap_ns) // 1000 * 1000 % size_ns, log_time + int(rng.integers(0, 3_000_000))
 
     with_times(tmp_path / "made.mcap", tmp_path / "wrapped.mcap", wrapped)
-    report = convert(tmp_path / "wrapped.mcap", tmp_path / "whole.mcap", correct=["stamps"])
+    report = convert(tmp_path / "wrapped.mcap", tmp_path / "whole.mcap", restamp=True)
     whole = read(tmp_path / "whole.mcap")
     origin_ns = wrap_ns - size_ns  # when the counter was at 0
     assert np.abs(whole.imu.t_ns + origin_ns - made.imu.t_ns).max() <= 2000
@@ -420,7 +420,7 @@ def own_type(made: Recording, target: Path, scale: float = 1.0) -> Path:
 
 
 def test_an_imu_of_a_drivers_own_type_is_one_beside_what_was_made_of_it(made: Recording, tmp_path: Path) -> None:
-    convert(own_type(made, tmp_path / "own.mcap"), tmp_path / "even.mcap", correct=["stamps"])
+    convert(own_type(made, tmp_path / "own.mcap"), tmp_path / "even.mcap", restamp=True)
     debias_log(tmp_path / "even.mcap", tmp_path / "debiased.mcap", model="static", init=(0.0,) * 6)
     with Log(tmp_path / "debiased.mcap") as log:
         assert (log.imu_topics, log.topics["/imu/debiased"].is_derived) == (["/imu"], True)
@@ -430,7 +430,7 @@ def test_an_imu_of_a_drivers_own_type_is_one_beside_what_was_made_of_it(made: Re
 def test_stamps_in_messages_of_a_drivers_own_type_are_corrected(made: Recording, tmp_path: Path) -> None:
     log = own_type(made, tmp_path / "own.mcap")
     assert any("fractions of a second are written in 100 ns, not in ns" in warning for warning in inspect(log).warnings)
-    report = convert(log, tmp_path / "even.mcap", correct=["stamps"])
+    report = convert(log, tmp_path / "even.mcap", restamp=True)
     assert any("fractions of a second are written in 100 ns" in note for note in report.notes)
     found = read(tmp_path / "even.mcap").imu
     assert np.abs(found.t_ns - made.imu.t_ns).max() <= 200
@@ -441,7 +441,7 @@ def test_stamps_in_messages_of_a_drivers_own_type_are_corrected(made: Recording,
 def test_units_and_stamps_in_messages_of_a_drivers_own_type_are_corrected_at_once(made: Recording, tmp_path: Path) -> None:
     resting = replace(made, imu=Imu(made.imu.t_ns, 0.001 * made.imu.gyro, np.tile([0.0, 0.0, 9.80665], (len(made.imu), 1))))
     log = own_type(resting, tmp_path / "own.mcap", scale=1 / 9.80665)
-    report = convert(log, tmp_path / "right.mcap", correct=["stamps", "conventions"])
+    report = convert(log, tmp_path / "right.mcap", fix=True, restamp=True)
     assert any("accel times 9.80665" in note and "other fields of its messages stay" in note for note in report.notes)
     found = read(tmp_path / "right.mcap").imu
     np.testing.assert_allclose(found.accel, resting.imu.accel, rtol=1e-12)
@@ -458,7 +458,7 @@ def test_poses_that_belong_before_the_zero_of_the_clock_are_left_out_and_counted
     late = Poses(t_ns, made.truth.p_wb[rows], made.truth.q_wb_wxyz[rows])
     imu = replace(made.imu, t_ns=made.imu.t_ns - start_ns)
     write(replace(made, imu=imu, truths={"/ground_truth/pose": late}), tmp_path / "late.mcap")
-    report = convert(tmp_path / "late.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    report = convert(tmp_path / "late.mcap", tmp_path / "right.mcap", fix=True)
     fixed = read(tmp_path / "right.mcap").truth
     assert fixed.t_ns[0] >= 0
     assert len(made.truth) - 2 <= len(fixed) <= len(made.truth)
@@ -479,7 +479,7 @@ def test_the_poses_follow_the_first_imu_and_another_mount_is_turned_to_it(made: 
     text = "\n".join(",".join(map(repr, row)) for row in poses.tolist())
     (source / "gt.csv").write_text("t [s],x,y,z,qw,qx,qy,qz\n" + text + "\n")
     convert(source, tmp_path / "two.mcap")
-    convert(tmp_path / "two.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    convert(tmp_path / "two.mcap", tmp_path / "right.mcap", fix=True)
     for topic in ("/imu_1/imu", "/imu_2/imu"):
         fixed = read(tmp_path / "right.mcap", imu=topic)
         np.testing.assert_allclose(fixed.imu.gyro, made.imu.gyro, atol=1e-12)
@@ -507,7 +507,7 @@ def test_a_drivers_json_that_is_turned_against_the_poses_keeps_its_axes(made: Re
             stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
             writer.add_message(imu, t_ns, json.dumps({"header": {"stamp": stamp}, **content}).encode(), t_ns)
         writer.finish()
-    report = convert(tmp_path / "json.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    report = convert(tmp_path / "json.mcap", tmp_path / "right.mcap", fix=True)
     assert any("the body is now that of the IMU" in note for note in report.notes)
     right = read(tmp_path / "right.mcap")
     np.testing.assert_allclose(right.imu.gyro, made.imu.gyro @ P.T, atol=1e-12)

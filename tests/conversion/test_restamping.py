@@ -56,7 +56,7 @@ def test_messages_that_share_a_stamp_are_told_of_and_restamped(stamps: np.ndarra
     with Log(tmp_path / "kept.mcap") as log:
         assert np.array_equal(np.concatenate([batch.stamp_ns for batch in raw_batches(log, "/imu0")]), stamps)
         assert any("--restamp" in line for line in log.metadata()["imutool/remarks"].values())
-    convert(tmp_path / "in.mcap", tmp_path / "even.mcap", correct=["stamps"])
+    convert(tmp_path / "in.mcap", tmp_path / "even.mcap", restamp=True)
     even = read(tmp_path / "even.mcap").imu
     assert np.abs(even.t_ns - T_NS).max() <= most_ms * MS
     assert np.array_equal(even.gyro, VALUES[:, :3])

@@ -239,7 +239,7 @@ def test_a_read_only_target_is_refused(source):
     with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):
         convert(source / "a", Path("/proc/a.mcap"))
     with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):  # and no temporary folder beside it
-        convert(source / "a", Path("/proc/a.mcap"), correct=["conventions"])
+        convert(source / "a", Path("/proc/a.mcap"), fix=True)
     with pytest.raises(ConfigError, match="/proc/imutool: cannot be made"):
         convert(source, Path("/proc/imutool"))
 

@@ -233,7 +233,7 @@ def test_the_command_that_corrects_estimated_poses_calls_them_true(
     evaluate(log, truth=topic)
     (told,) = [line.getMessage() for line in caplog.records if "has -z up" in line.getMessage()]
     assert told.endswith(f"imutool convert LOG OUT --fix --kind {topic}=truth corrects it")
-    convert(log, fixed, kinds=[f"{topic}=truth"], correct=["conventions"])
+    convert(log, fixed, kinds=[f"{topic}=truth"], fix=True)
     caplog.clear()
     (found,) = evaluate(fixed, truth=topic)
     assert found["ape_m"] is not None
