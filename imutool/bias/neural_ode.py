@@ -70,9 +70,9 @@ class Config(Settings, frozen=True):
     gyro_scale_rad_s: Positive = 0.2  # rate that is 1 at the networks' input
     gyro_curve_rad_s: Positive = 0.02  # bias that is 1 at the curve's output
     gyro_drift_rad_s2: Positive = 1e-4  # change of the bias that is 1 at the drift's output
-    accel_scale_m_s2: Positive = 10.0  # the same three of the accelerometer: input
-    accel_curve_m_s2: Positive = 0.2  # curve
-    accel_drift_m_s3: Positive = 1e-3  # drift
+    accel_scale_m_s2: Positive = 10.0  # specific force that is 1 at the networks' input
+    accel_curve_m_s2: Positive = 0.2  # bias that is 1 at the curve's output
+    accel_drift_m_s3: Positive = 1e-3  # change of the bias that is 1 at the drift's output
 
     @property
     def paper(self) -> bool:

@@ -92,8 +92,9 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     start = replace(start, std=supported_std(start.std, start.least, offset, variance + WORLD_TILT_STD**2))
     rest, std = _updated(start, offset, variance)
     late = f", of poses {1e3 * abs(late_s):.0f} ms {'late' if late_s > 0 else 'early'}" if late_s else ""
-    late += ", whose thirds contradict each other" if (variance > usual)[:3].any() else ""
-    how = f"truth over {length_s:.1f} s{late}{', weighed against the training runs' if model.card else ''}, {accuracy(std)}"
+    doubt = ", whose thirds contradict each other" if (variance > usual)[:3].any() else ""
+    weighed = ", weighed against the training runs" if model.card else ""
+    how = f"truth over {length_s:.1f} s{late}{doubt}{weighed}, {accuracy(std)}"
     if not model.card:
         return InitialBias(rest, std, how)
     mean, spread = _updated(start, offset, variance + WORLD_TILT_STD**2)
@@ -106,7 +107,8 @@ def _variance(usual: Vector6, thirds: Sequence[Vector6]) -> Vector6:
     """Variance of an offset: the usual one, or if those of thirds of the poses contradict it, what these show.
 
     Poses of a log may be worse than those of the training logs: markers are exchanged, a clock wanders. The usual variance of a
-    third is 9 (errors that last) to 27 times (white ones) as large. Of poses that contradict it, a third of it is believed.
+    third is 9 (errors that last) to 27 times (white ones) as large. Errors that contradict it are taken to last even longer:
+    the variance of the whole is a third of what the thirds show.
     """
     variance = usual.copy()
     if len(thirds) == PARTS:

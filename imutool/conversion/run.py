@@ -83,7 +83,7 @@ def convert(
         ImutoolError: the only sequence there is (or was asked for) failed; of several, failures go to the report.
     """
     labels = Labels(sensor, parse_kinds(kinds), parse_pair(imu))
-    corrected = (*[CONVENTIONS] * fix, *[STAMPS] * restamp)
+    corrected = tuple(name for name, asked in ((CONVENTIONS, fix), (STAMPS, restamp)) if asked)
     ways = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
         return _from_stream(module, source, out, sequences, ways, progress)

@@ -22,15 +22,8 @@ NAME = "fleet.parquet"
 ROWS = 4096  # in a group; of a million logs no more are held
 SCHEMA = "imutool.fleet-results/1"
 MOST_ROWS = 500  # in a table: more is for the Parquet file
-MAY_LACK = (
-    "target",
-    "error",
-    "target_sha256",
-    "target_digest",
-    "robot",
-    "peak_bytes",
-    "host",
-)  # columns that are null where they are empty
+# columns that are null where they are empty
+MAY_LACK = ("target", "error", "target_sha256", "target_digest", "robot", "peak_bytes", "host")
 TROUBLE = ("failed", "quarantined", "lost")
 
 

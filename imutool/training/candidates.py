@@ -20,12 +20,12 @@ from imutool.bias.networks.temperature import temperature_tensors
 from imutool.bias.temperature import Scale
 from imutool.training.bias_spread import speed_of, store_statistics, turn_on_prior
 from imutool.training.calibration.effect_selection import (
-    LEAST_GAIN,
     LINEAR,
     Calibration,
     effects_beyond_chance,
     parameter_columns,
 )
+from imutool.training.calibration.log_scatter import LEAST_GAIN
 from imutool.training.calibration.normal_equations import gain_of
 from imutool.training.log_signals import effects_turned_alike
 from imutool.training.settings import TrainSettings

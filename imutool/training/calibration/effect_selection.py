@@ -32,7 +32,7 @@ from imutool.recording import Imu, Recording
 from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import Load, Signals
-from imutool.training.calibration.log_scatter import widest
+from imutool.training.calibration.log_scatter import LEAST_GAIN, widest
 from imutool.training.calibration.normal_equations import Problem, Seen, Terms, gain_of, linearise
 from imutool.training.fit import Epoch, note
 from imutool.training.log_signals import effects_turned_alike, loaded_signals, signals_of
@@ -41,7 +41,6 @@ from imutool.training.training_windows import Part, Pool
 from imutool.units import SENSORS, Sensor
 
 BY_CHANCE = 0.01  # probability of finding any effect where there is none
-LEAST_GAIN = 0.03  # of the judged loss, for an effect to be worth its parameters
 DRIFTS = dict.fromkeys(("gyro_warm_up", "gyro_rate_load", "gyro_force_load", *temperature.EFFECTS), 0.3)  # they look alike
 LINEAR: Mapping[Sensor, tuple[str, ...]] = {sensor: (f"{sensor}_misalignment", f"{sensor}_scale") for sensor in SENSORS}
 CONTAINED = {"rate_curve": "gyro_scale"}  # a curve imitates a scale, which then needs evidence as any other effect
