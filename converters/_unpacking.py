@@ -161,7 +161,7 @@ def _zip_files(source: Path) -> Iterator[tuple[str, IO[bytes]]]:
             if info.flag_bits & ENCRYPTED:
                 where = f"{source}/{plain_name(info.filename)}"
                 raise DataError("is encrypted", where=where, fix="Unpack it with its password, and convert what is in it")
-            if not info.is_dir():
+            if info.filename and not info.is_dir():
                 with archive.open(info) as file:
                     yield plain_name(info.filename), file
 

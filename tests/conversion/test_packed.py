@@ -190,6 +190,14 @@ def test_an_encrypted_zip_is_refused(log: Path) -> None:
     refused(source, r"walk\.zip/walk\.mcap: is encrypted.*Unpack it with its password")
 
 
+def test_a_member_of_a_zip_without_a_name_is_left_out(log: Path, tmp_path: Path) -> None:
+    source = zipped(log.with_name("walk.zip"), {"walk.mcap": log.read_bytes(), "extra": b"1"})
+    source.write_bytes(source.read_bytes().replace(b"extra", bytes(5)))
+    log.unlink()
+    convert(log.parent, tmp_path / "out")
+    assert [path.name for path in tmp_path.glob("out/**/*.mcap")] == ["walk.mcap"]
+
+
 @pytest.mark.parametrize("name", ["../walk.mcap", "/tmp/walk.mcap", "a/../../walk.mcap"])
 @pytest.mark.parametrize("pack", [zipped, tarred])
 def test_a_member_outside_the_archive_is_refused(log: Path, name: str, pack: Callable[..., Path]) -> None:
