@@ -19,7 +19,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._mcap_chunks import RECORD_HEAD, in_order
+from ._mcap_chunks import RECORD_HEAD, beside_messages, in_order, summary_of
 from ._source import find_files, find_folders, head, name, with_suffix
 
 GENERAL = True
@@ -66,20 +66,20 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         return _read_parts(sequence, images)
     with _refusing(sequence.path), sequence.path.open("rb") as file:
         reader = _reader(file)
-        summary = reader.get_summary()
-        metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
+        summary = summary_of(reader, file)
+        metadata, attachments = beside_messages(reader, summary, file)
+        of_channel = summary.statistics.channel_message_counts if summary.statistics is not None else {}
         counts: dict[str, int] = {}
         topics: list[MessageTopic] = []
-        if summary is not None and summary.statistics is not None:
-            of_channel = summary.statistics.channel_message_counts
-            for number, channel in summary.channels.items():
-                schema = summary.schemas.get(channel.schema_id)
-                if images or not re.fullmatch(IMAGES, schema.name if schema else ""):
-                    if schema is not None and _may_be_imu(schema.name, channel.message_encoding):
-                        topics.append(_topic(schema, channel))
+        for number, channel in summary.channels.items():
+            schema = summary.schemas.get(channel.schema_id)
+            if images or not re.fullmatch(IMAGES, schema.name if schema else ""):
+                if schema is not None and _may_be_imu(schema.name, channel.message_encoding):
+                    topics.append(_topic(schema, channel))
+                if summary.statistics is not None:
                     counts[channel.topic] = counts.get(channel.topic, 0) + of_channel.get(number, 0)
         own = {**metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
-        unchecked = _without_crc(file, [] if summary is None else summary.chunk_indexes)
+        unchecked = _without_crc(file, summary.chunk_indexes)
     log = MessageLog(
         sequence.name,
         sequence.path.name,
@@ -88,6 +88,8 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         counts=counts,
         metadata={"imutool": own, **metadata},
     )
+    if attachments:
+        log.remarks.losses.append(f"attachments are not carried over: {', '.join(attachments)}")
     log.remarks.notes += [f"{unchecked} chunks state no CRC: their messages are not checked"] if unchecked else []
     return log
 
@@ -187,6 +189,7 @@ def _read_parts(sequence: Sequence, images: bool) -> MessageLog:
         if is_finished:
             part = read_sequence(Sequence(path.stem, path), images=images)
             remarks.notes += [note for note in part.remarks.notes if note not in remarks.notes]
+            remarks.losses += part.remarks.losses
             counts.update(part.counts)
             found, messages = part.topics, part.messages
         else:

@@ -1,0 +1,78 @@
+"""MCAP logs of other writers: what their summaries leave out, and what stands beside the messages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import IndexType, Writer
+
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import encode_imu
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
+
+COUNT = 200
+T_NS = 1_700_000_000 * 10**9 + np.arange(COUNT, dtype=np.int64) * 5_000_000
+GYRO = np.random.default_rng(5).normal(0, 0.1, (COUNT, 3))
+ACCEL = np.random.default_rng(6).normal(0, 0.1, (COUNT, 3)) + np.array([0.0, 0.0, 9.81])
+NO_INDEX: dict[str, Any] = {
+    "repeat_channels": False,
+    "repeat_schemas": False,
+    "use_statistics": False,
+    "use_summary_offsets": False,
+    "index_types": IndexType.NONE,
+}
+
+
+def write_log(path: Path, topics: tuple[str, ...] = ("/imu",), *, beside: bool = False, **options: Any) -> Path:
+    """Log of the same samples on each topic, with two metadata records of one name and an attachment on request."""
+    rows = encode_imu(T_NS, GYRO, ACCEL, "imu")
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=10_000, **options)
+        writer.start("ros2")
+        schema = writer.register_schema(schemas.IMU, "ros2msg", schemas.definition(schemas.IMU).encode())
+        channels = [writer.register_channel(topic, "cdr", schema) for topic in topics]
+        for t_ns, row in zip(T_NS.tolist(), rows, strict=True):
+            for channel in channels:
+                writer.add_message(channel, t_ns, row.tobytes(), t_ns)
+        if beside:
+            writer.add_metadata("rig", {"camera": "left"})
+            writer.add_metadata("rig", {"mount": "roof"})
+            writer.add_attachment(T_NS[0], T_NS[0], "calibration.yaml", "text/yaml", b"gain: 1")
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"repeat_channels": False}, {"repeat_schemas": False}, {"repeat_channels": False, "use_statistics": False}, NO_INDEX],
+)
+def test_a_summary_without_definitions_costs_no_message(convert, tmp_path, options):
+    done = convert(write_log(tmp_path / "in.mcap", **options), tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    imu = read(tmp_path / "out.mcap").imu
+    assert np.array_equal(imu.t_ns, T_NS)
+    assert np.array_equal(imu.gyro, GYRO)
+
+
+@pytest.mark.parametrize("options", [{"use_statistics": False}, NO_INDEX])
+def test_two_sensors_are_joined_without_statistics(convert, tmp_path, options):
+    source = write_log(tmp_path / "in.mcap", ("/camera/gyro/sample", "/camera/accel/sample"), **options)
+    assert convert(source, tmp_path / "out.mcap").returncode == 0
+    with Log(tmp_path / "out.mcap") as log:
+        assert log.imu_topics == ["/camera/imu"]
+        assert log.topics["/camera/imu"].count == COUNT
+
+
+@pytest.mark.parametrize("options", [{}, {"index_types": IndexType.CHUNK}, NO_INDEX])
+def test_metadata_of_one_name_are_kept_and_attachments_are_a_loss(convert, tmp_path, options):
+    done = convert(write_log(tmp_path / "in.mcap", beside=True, **options), tmp_path / "out.mcap")
+    assert done.returncode == 3
+    assert "attachments are not carried over: calibration.yaml" in done.stderr
+    with (tmp_path / "out.mcap").open("rb") as file:
+        found = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
+    assert found["rig"] == {"camera": "left", "mount": "roof"}
