@@ -14,6 +14,8 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+import zstandard
+
 from imutool.errors import DataError, required
 from imutool.recording.message_log import MessageTopic
 
@@ -26,6 +28,7 @@ TYPE = re.compile(r"[A-Z][A-Za-z0-9]*")
 CONSTANT_NAME = re.compile(r"[A-Z]([A-Z0-9_]?[A-Z0-9]+)*")
 CONSTANT = re.compile(r"^[ \t]*[a-z0-9]+[ \t]+\w+[ \t]*=.*$", re.MULTILINE)  # a line of a definition
 MSG_TYPE = re.compile(r"\w+/msg/\w+")
+ZSTD, LARGEST = b"\x28\xb5\x2f\xfd", 1 << 30  # first bytes of what zstd made, and bytes of one message
 WORKSPACES = "AMENT_PREFIX_PATH"  # what `source install/setup.bash` sets
 ToCdr = Callable[["bytes | memoryview"], "bytes | memoryview"]
 
@@ -43,6 +46,22 @@ def ros2_name(kind: str) -> str:
     """Message type in ROS 2 spelling."""
     package, _, name = kind.partition("/")
     return f"{package}/msg/{name}" if "/" not in name else kind
+
+
+def plain_cdr(payload: bytes | memoryview) -> bytes | memoryview:
+    """A message in CDR, unpacked if rosbag2 compressed it alone, as metadata.yaml says.
+
+    Raises:
+        ValueError: it does not unpack.
+    """
+    if payload[:4] != ZSTD:  # CDR begins with a zero
+        return payload
+    try:
+        if not 0 <= (size := zstandard.frame_content_size(payload)) <= LARGEST:
+            raise ValueError(f"a compressed message says it has {size} bytes")
+        return bytes(zstandard.ZstdDecompressor().decompress(payload))
+    except zstandard.ZstdError as error:
+        raise ValueError(f"a compressed message does not unpack: {error}") from error
 
 
 @cache

@@ -20,6 +20,7 @@ from imutool.recording.message_log import Message, MessageLog, MessageTopic, Rem
 
 from . import Sequence
 from ._mcap_chunks import RECORD_HEAD, beside_messages, in_order, summary_of
+from ._ros_types import plain_cdr
 from ._source import find_files, find_folders, head, name, with_suffix
 
 GENERAL = True
@@ -242,7 +243,8 @@ def _unfinished(path: Path, images: bool) -> Iterator[Message]:
                 elif isinstance(part, Channel):
                     topics[part.id] = _topic(schemas.get(part.schema_id), part)
                 elif isinstance(part, Record) and (images or not re.fullmatch(IMAGES, topics[part.channel_id].schema_name)):
-                    yield Message(topics[part.channel_id], part.log_time, part.publish_time, part.data)
+                    topic = topics[part.channel_id]
+                    yield Message(topic, part.log_time, part.publish_time, _plain(topic, part.data))
             if file.tell() >= end:
                 return
 
@@ -262,7 +264,11 @@ def _messages(path: Path, images: bool) -> Iterator[Message]:
             if topic is None:
                 topic = topics[channel.id] = _topic(schema, channel)
             if images or not re.fullmatch(IMAGES, topic.schema_name):
-                yield message._replace(topic=topic)
+                yield message._replace(topic=topic, payload=_plain(topic, message.payload))
+
+
+def _plain(topic: MessageTopic, payload: bytes | memoryview) -> bytes | memoryview:
+    return plain_cdr(payload) if topic.message_encoding == "cdr" else payload
 
 
 def _topic(schema: Any, channel: Any) -> MessageTopic:

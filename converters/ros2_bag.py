@@ -21,7 +21,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._ros_types import definition_from_files, need_rosbags, ros2_definition
+from ._ros_types import definition_from_files, need_rosbags, plain_cdr, ros2_definition
 from ._source import find_files, find_folders, head, with_suffix
 
 GENERAL = True
@@ -136,7 +136,7 @@ def _messages(path: Path, topics: dict[str, MessageTopic]) -> Iterator[Message]:
             files = getattr(reader, "storages", [reader])  # metadata.yaml may state another quality of service than the files
             wanted = [c for file in files for c in file.connections if c.topic in topics]
             for connection, time_ns, payload in reader.messages(wanted):
-                yield Message(topics[connection.topic], time_ns, time_ns, payload)
+                yield Message(topics[connection.topic], time_ns, time_ns, plain_cdr(payload))
 
 
 def _misleads(folder: Path, remarks: Remarks) -> bool:

@@ -118,6 +118,29 @@ def test_a_bag_without_metadata_and_a_lone_database_convert(convert, tmp_path):
     assert messages_of(tmp_path / "a.mcap") == messages_of(tmp_path / "b.mcap")
 
 
+@pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+@pytest.mark.parametrize("alone", [False, True])
+def test_messages_that_were_compressed_one_by_one_are_unpacked_without_metadata(convert, tmp_path, storage, alone):
+    """Only metadata.yaml says that they are; the recorder writes it last, and a part of the bag may be sent alone."""
+    bag = write_bag(tmp_path / "bag", storage, CompressionMode.MESSAGE)
+    with Reader(bag) as reader:
+        theirs = [(c.topic, t_ns, bytes(data)) for c, t_ns, data in reader.messages()]
+    (bag / "metadata.yaml").unlink()
+    done = convert(next(bag.glob("bag*.*")) if alone else bag, tmp_path / "bag.mcap")
+    assert done.returncode == 0, done.stderr
+    assert sorted(messages_of(tmp_path / "bag.mcap")[0]) == sorted(theirs)
+
+
+def test_a_compressed_message_that_does_not_unpack_is_refused_in_one_sentence(convert, tmp_path):
+    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.MESSAGE)
+    (bag / "metadata.yaml").unlink()
+    change(bag, "UPDATE messages SET data = substr(data, 1, 20) WHERE id = 5")
+    done = convert(bag, tmp_path / "bag.mcap")
+    assert done.returncode == 4
+    assert "a compressed message does not unpack" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 @pytest.mark.parametrize("form", ["zip", "gztar", "zip of its files"])
 def test_a_packed_bag_reads_as_the_bag(convert, tmp_path, form):
     bag = split_bag(tmp_path / "bag", StoragePlugin.SQLITE3, None)
