@@ -14,6 +14,7 @@ from ._table_mat import check_size
 from ._table_text import Columns
 
 MOST_CELLS = 10_000  # of a cell array
+FILLS = "_FillValue", "missing_value"  # attributes that say what stands for a missing value
 DEEPEST = 8  # groups below a cell: one may lead to itself
 
 
@@ -85,7 +86,19 @@ def _add_node(columns: Columns, name: str, node: Any, path: Path) -> None:
         columns.add(name, np.array([_word(row) for row in node[()].T]))
     else:
         unit = next((value for key, value in node.attrs.items() if key.lower() in ("unit", "units")), "")
-        columns.add(name, node[()], _plain(unit))
+        columns.add(name, _measured(node), _plain(unit))
+
+
+def _measured(node: Any) -> Any:
+    """Values of an array as NetCDF packs them: NaN for its fill values, the others scaled, then shifted."""
+    values, attributes = node[()], {key: np.asarray(value).ravel() for key, value in node.attrs.items()}
+    stated = {key: value[0] for key, value in attributes.items() if value.size == 1 and value.dtype.kind in "iuf"}
+    lacking = [stated[key] for key in FILLS if key in stated]
+    if lacking and (rows := np.isin(values, lacking)).any():
+        values = np.where(rows, np.nan, values)
+    if {"scale_factor", "add_offset"} & stated.keys():
+        values = values * float(stated.get("scale_factor", 1.0)) + float(stated.get("add_offset", 0.0))
+    return values
 
 
 def _add_cells(columns: Columns, name: str, node: Any, path: Path) -> None:
@@ -131,5 +144,6 @@ def _texts_of(values: np.ndarray) -> np.ndarray:
 
 
 def _plain(attribute: Any) -> str:
-    """Text of an attribute, which MATLAB writes as bytes."""
+    """Text of an attribute, which MATLAB writes as bytes and some programs as an array of one."""
+    attribute = attribute.item() if isinstance(attribute, np.ndarray) and attribute.size == 1 else attribute
     return attribute.decode(errors="replace") if isinstance(attribute, bytes) else str(attribute)

@@ -155,6 +155,22 @@ def test_the_unit_beside_an_array_in_hdf5_counts(tmp_path):
     np.testing.assert_allclose(imu.accel, ACCEL * G)
 
 
+@pytest.mark.parametrize("unit", ["rad/s", [b"rad/s"]])
+def test_numbers_that_netcdf_packs_are_scaled_and_its_fill_values_are_missing(tmp_path, unit):
+    import h5py
+
+    scale, packed = 2.0**-10, np.rint(GYRO * 2**10).astype(np.int32)
+    packed[3, 1] = -32768
+    with h5py.File(tmp_path / "log.nc", "w") as file:
+        file["time_ns"], gyro = T_NS, file.create_dataset("gyro", data=packed)
+        gyro.attrs.update({"units": unit, "scale_factor": [scale], "add_offset": 0.5, "_FillValue": np.int32([-32768])})
+        file.create_dataset("accel", data=ACCEL).attrs["units"] = "m/s^2"
+    (sequence,) = table.sequences(tmp_path / "log.nc")
+    imu = table.read_sequence(sequence).imus["/imu0"]
+    assert imu.t_ns.tolist() == [t for n, t in enumerate(T_NS.tolist()) if n != 3]
+    np.testing.assert_allclose(imu.gyro, np.delete(packed, 3, axis=0) * scale + 0.5)
+
+
 def test_a_spreadsheet_of_another_format_is_refused_with_what_to_do(convert, tmp_path):
     with zipfile.ZipFile(tmp_path / "log.xlsb", "w") as archive:
         archive.writestr("[Content_Types].xml", "<Types/>")
