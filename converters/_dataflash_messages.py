@@ -20,6 +20,7 @@ HEAD, FMT = b"\xa3\x95", 128
 FMT_SIZE = 89
 TYPES = {
     **{"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4", "q": "<i8", "Q": "<u8", "f": "<f4"},
+    "g": "<f2",
     **{"d": "<f8", "L": "<i4", "c": "<i2", "C": "<u2", "e": "<i4", "E": "<u4", "n": "S4", "N": "S16", "Z": "S64"},
     "a": "(32,)<i2",
 }
@@ -129,7 +130,8 @@ def _binary_messages(raw: bytes, remarks: Remarks) -> dict[str, Messages]:
         form = formats[number]
         rows = data[np.array(places)[:, None] + np.arange(3, form.size)[None, :]]
         values = np.ascontiguousarray(rows).view(form.dtype)[:, 0] if form.labels else np.zeros(len(places), form.dtype)
-        found[form.name] = _messages(values, places)
+        name = form.name if form.name not in found else f"{form.name}_{number}"  # two formats of one name
+        found[name] = _messages(values, places)
     return found
 
 

@@ -151,11 +151,11 @@ def table_of(name: str, columns: Columns, start_ns: int) -> Table:
     groups: dict[str, list[str]] = {}
     for column in columns:
         groups.setdefault(re.sub(r"\[\d+\]$", "", column), []).append(column)
-    fields, values = [], {}
+    fields, values = [], dict[str, np.ndarray]()
     for group, members in groups.items():
         field = re.sub(r"[^a-z0-9]+", "_", group.lower()).strip("_") or "unnamed"
         while field in values:  # damage makes names alike
-            field += "_"
+            field = f"{field}_{len(values)}"
         kind = np.result_type(*(columns[member].dtype for member in members))
         shape = (len(members),) if members != [group] else ()
         fields.append((field, kind, shape))

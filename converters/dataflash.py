@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -188,12 +189,17 @@ def _table(name: str, messages: Messages) -> Table:
     """Numbers of a message type; texts are left to the metadata."""
     rows = messages.rows
     names = [field for field in messages.fields if rows.dtype[field].kind != "S"]
-    fields = [(_field(field), rows.dtype[field]) for field in names]
+    fields: list[tuple[str, np.dtype[Any]]] = []
+    for field in names:
+        new = _field(field)
+        while new in dict(fields):  # a script may log both Roll and roll
+            new = f"{new}_{len(fields)}"
+        fields.append((new, np.dtype("<f4") if rows.dtype[field] == np.float16 else rows.dtype[field]))
     content = np.zeros(len(rows), np.dtype(fields))
     for field, (new, _) in zip(names, fields, strict=True):
         content[new] = rows[field]
     order = np.argsort(messages.t_ns, kind="stable")
-    return Table(messages.t_ns[order], content[order], f"ardupilot/msg/{name.capitalize()}")
+    return Table(messages.t_ns[order], content[order], f"ardupilot/msg/{name.replace('_', '').capitalize()}")
 
 
 def _field(label: str) -> str:

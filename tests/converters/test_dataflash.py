@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,6 +61,26 @@ def test_a_number_that_cannot_be_read_costs_its_own_message_alone(tmp_path):
     log = dataflash.read_sequence(dataflash.sequences(path)[0])
     assert log.remarks.losses == ["1 messages IMU are left out: could not convert string to float: '`0.2'"]
     assert [len(imu) for imu in log.imus.values()] == [499, 500]
+
+
+def test_names_that_differ_by_capitals_and_formats_of_one_name_are_kept_apart(convert, tmp_path):
+    """As scripts log them; `g` is a float of two bytes."""
+    formats = {201: (b"LUA", b"Qgg", b"TimeUS,Roll,roll"), 202: (b"LUA", b"QB", b"TimeUS,State")}
+    raw = b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", 128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
+    for number, (name, letters, labels) in formats.items():
+        size = 3 + struct.calcsize("<" + letters.decode().replace("g", "e"))
+        raw += b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, size, name, letters, labels)
+    for n in range(5):
+        raw += b"\xa3\x95\xc9" + struct.pack("<Qee", 1000 * n, 0.5, n) + b"\xa3\x95\xca" + struct.pack("<QB", 1000 * n, n)
+    (tmp_path / "1.bin").write_bytes(raw)
+    done = convert(tmp_path / "1.bin", tmp_path / "out.mcap")
+    assert "Traceback" not in done.stderr
+    found = dict[str, list[Any]]()
+    with (tmp_path / "out.mcap").open("rb") as file:
+        for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            values = (message.roll, message.roll_2) if channel.topic == "/LUA" else message.state
+            found.setdefault(channel.topic, []).append(values)
+    assert found == {"/LUA": [(0.5, n) for n in range(5)], "/LUA_202": [*range(5)]}
 
 
 def test_an_imu_of_other_fields_is_named_as_lost(tmp_path):

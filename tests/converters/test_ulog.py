@@ -206,3 +206,14 @@ def test_the_public_samples_hold_the_values_that_pyulog_reads(tmp_path, data, sa
 def test_a_ulog_is_known_by_its_content(tmp_path):
     (sequence,) = ulog.sequences(ulog_flight().write(tmp_path / "download"))
     assert ulog.read_sequence(sequence).name == "download"
+
+
+def test_fields_whose_names_differ_by_capitals_have_names_that_ros_reads(convert, tmp_path):
+    writer = Ulog()
+    writer.topic("sensor_combined", COMBINED, [(START_US, 0.1, 0.2, 0.3, 4000, 0, 1.0, 2.0, -9.75, 4000)])
+    writer.topic("script", "uint64_t timestamp;float Roll;float roll", [(START_US, 1.0, 2.0)])
+    assert convert(writer.write(tmp_path / "flight.ulg"), tmp_path / "out.mcap").returncode in (0, 3)
+    with (tmp_path / "out.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        (message,) = [found for _, channel, _, found in reader.iter_decoded_messages(["/script"])]
+    assert (message.roll, message.roll_2) == (1.0, 2.0)
