@@ -110,7 +110,10 @@ def _routes(bag: Bag, types: Ros1Types, remarks: Remarks, images: bool) -> dict[
             )
         if _inner(connection.record).get(b"latching") == b"1":
             topic = replace(topic, metadata=(*topic.metadata, ("latching", "1")))
-        if by_name.setdefault(topic.name, topic) != topic:
+        known = by_name.setdefault(topic.name, topic)
+        if replace(known, metadata=()) == replace(topic, metadata=()):
+            topic = known  # of several publishers, of which one may latch
+        else:
             other = f"{topic.name}/{connection.kind.replace('/', '_')}_{number}"
             remarks.notes.append(f"{topic.name} carries two message types; {connection.kind} is on {other}")
             topic = replace(topic, name=other)
@@ -121,7 +124,7 @@ def _routes(bag: Bag, types: Ros1Types, remarks: Remarks, images: bool) -> dict[
 
 def _definition(record: bytes) -> str:
     """Text of the message definition in a connection record."""
-    return _inner(record)[b"message_definition"].decode()
+    return _inner(record)[b"message_definition"].decode().replace("\r\n", "\n")  # of a publisher on Windows
 
 
 def _inner(record: bytes) -> dict[bytes, bytes]:

@@ -166,6 +166,20 @@ def test_the_order_holds_across_chunks(tmp_path):
     assert len(times) == 100 * len(TOPICS)
 
 
+@pytest.mark.parametrize("ending", ["\n", "\r\n"])
+def test_publishers_of_one_topic_share_it_where_one_of_them_latches(convert, tmp_path, ending):
+    definition, md5 = STORE.generate_msgdef("sensor_msgs/msg/Imu")
+    form = {"msgdef": definition.replace("\n", ending), "md5sum": md5}
+    with Writer(tmp_path / "two.bag") as bag:
+        two = [bag.add_connection("/imu", "sensor_msgs/msg/Imu", callerid=f"/{n}", latching=n, **form) for n in (0, 1)]
+        for n in range(20):
+            t_ns = START_NS + n * 10_000_000
+            bag.write(two[n % 2], t_ns, STORE.serialize_ros1(imu(t_ns, n), "sensor_msgs/msg/Imu"))
+    done = convert(tmp_path / "two.bag", tmp_path / "two.mcap")
+    assert (done.returncode, done.stderr.strip()) == (0, "")
+    assert {topic: len(rows) for topic, rows in decoded(tmp_path / "two.mcap").items()} == {"/imu": 20}
+
+
 def test_no_images_leaves_out_images_alone(convert, tmp_path):
     assert convert(write_bag(tmp_path / "run.bag"), tmp_path / "run.mcap", "--no-images").returncode == 0
     assert set(decoded(tmp_path / "run.mcap")) == set(TOPICS) - {"/camera/image_raw"}
