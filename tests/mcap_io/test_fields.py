@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import tracemalloc
 from collections.abc import Callable
 from contextlib import suppress
@@ -235,6 +236,34 @@ def test_stamps_that_were_never_set_give_way_to_the_logs_times(tmp_path: Path) -
     rows = [("/odom", ODOMETRY, START_NS + i, odometry(0, np.zeros(6))) for i in range(9)]
     path = write(tmp_path / "unset.mcap", rows)
     assert read_field(path, "/odom.twist.twist.linear.x").t_ns.tolist() == [START_NS + i for i in range(9)]
+
+
+HEADER = b"=" * 80 + b"\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+
+
+def test_a_header_behind_the_numbers_gives_its_stamp(tmp_path: Path) -> None:
+    payload = struct.pack("<IdiII", 0x100, 1.5, 20, 7, 1) + b"\0"
+    path = raw(tmp_path / "late.mcap", b"float64 a\nstd_msgs/Header header\n" + HEADER, payload)
+    found = read_field(path, "/a.a")
+    assert (found.t_ns.tolist(), found.values.tolist()) == ([20 * 10**9 + 7], [1.5])
+
+
+@pytest.mark.parametrize(
+    ("second", "is_read"), [(b"float64 a # metres\n\nfloat64 b\n", True), (b"float64 b\nfloat64 a\n", False)]
+)
+def test_two_definitions_of_a_topics_messages_are_never_mistaken_for_one(tmp_path: Path, second: bytes, is_read: bool) -> None:
+    with (tmp_path / "merged.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for n, definition in enumerate((b"float64 a\nfloat64 b\n", second)):
+            channel = writer.register_channel("/a", "cdr", writer.register_schema("a/msg/A", "ros2msg", definition))
+            writer.add_message(channel, START_NS + n, struct.pack("<Idd", 0x100, 1.0, 2.0), START_NS + n)
+        writer.finish()
+    if is_read:
+        assert read_field(tmp_path / "merged.mcap", "/a.a").values.tolist() == [1.0, 1.0]
+        return
+    with pytest.raises(LogError, match="two definitions of a/msg/A are on /a"):
+        read_field(tmp_path / "merged.mcap", "/a.a")
 
 
 def raw(path: Path, definition: bytes, payload: bytes, *, name: str = "a/msg/A", language: str = "ros2msg") -> Path:

@@ -19,7 +19,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import ros2_definition, schemas
 from imutool.mcap_io.codec.formats import LACKS, MAX_ROW, NumberFormat, Path, fields_of, stamps_of
 from imutool.mcap_io.codec.reflection import format_of, tree_of
-from imutool.mcap_io.codec.ros2_definition import Leaf
+from imutool.mcap_io.codec.ros2_definition import Definition, Field, Leaf
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import REFLECTED, Topic
 
@@ -70,7 +70,9 @@ def decoder_of(log: Log, topic: Topic) -> Decoder:
     if (topic.schema_encoding, topic.message_encoding) in DESCRIBED:
         parse = _parse_idl if topic.schema_encoding == "ros2idl" else ros2_definition.parse
         with log.named(topic.name):
-            return Described(parse(name, data), topic.message_encoding)
+            definition = parse(name, data)
+            _check_alone(log, topic, definition, parse)
+            return Described(definition, topic.message_encoding)
     if topic.message_encoding not in REFLECTED:
         raise LogError(
             f"{topic.name} is described as {topic.schema_encoding or 'nothing'!r} and encoded as {topic.message_encoding!r}",
@@ -89,7 +91,24 @@ def decoder_of(log: Log, topic: Topic) -> Decoder:
     return Parsed(form, topic.message_encoding)
 
 
-def _parse_idl(schema_name: str, text: bytes) -> ros2_definition.Definition:
+def _check_alone(log: Log, topic: Topic, definition: Definition, parse: Callable[[str, bytes], Definition]) -> None:
+    """Refuse a topic whose channels lay out messages of one name in several ways, as logs that were merged do.
+
+    Raises:
+        LogError: they do.
+    """
+    numbers = {channel.schema_id for channel in log.index.channels.values() if channel.topic == topic.name}
+    for data in {log.index.schemas[number].data for number in numbers if number in log.index.schemas}:
+        if _layout(parse(topic.schema_name, data)) != _layout(definition):
+            what = f"two definitions of {topic.schema_name} are on {topic.name}"
+            raise LogError(what, expected="one", fix="Read the logs one by one that were merged to this one")
+
+
+def _layout(definition: Definition) -> dict[str, list[Field]]:
+    return {name: [field._replace(comment="") for field in fields] for name, fields in definition.items()}
+
+
+def _parse_idl(schema_name: str, text: bytes) -> Definition:
     """Fields of a message and of nested ones from a `ros2idl` definition. Needs rosbags.
 
     Raises:
@@ -123,7 +142,7 @@ def _parse_idl(schema_name: str, text: bytes) -> ros2_definition.Definition:
 class Described:
     """Messages of ROS: where their numbers lie follows from a definition."""
 
-    def __init__(self, definition: ros2_definition.Definition, encoding: str) -> None:
+    def __init__(self, definition: Definition, encoding: str) -> None:
         self._walk: Callable[[bytes], ros2_definition.Walk] = lambda raw: ros2_definition.Walk(raw, definition, encoding)
 
     def paths(self, raw: bytes, long: bool) -> list[str]:
@@ -176,13 +195,16 @@ def _places(walk: ros2_definition.Walk, paths: Sequence[str]) -> dict[str, Leaf]
         bare, index = _LAST.fullmatch(path).groups()  # type: ignore[union-attr]  # it matches any text
         asked.setdefault(bare, []).append((path, None if index is None else int(index)))
     found: dict[str, Leaf] = {}
+    root = walk.definition[walk.definition[""][0].kind]
+    stamps = len(_HEADER) if any((field.name, field.kind) == ("header", "std_msgs/Header") for field in root) else 0
     for leaf in walk.leaves():
         if leaf.path in _HEADER:
+            stamps -= 1
             found[f"stamp {leaf.path}"] = leaf
         for path, index in asked.get(leaf.path, ()):
             if (index is None) == (leaf.length is None) and (leaf.length is None or (index or 0) < leaf.length):
                 found[path] = leaf._replace(offset=leaf.offset + int(leaf.kind[1]) * (index or 0))
-        if all(path in found for path in paths):
+        if stamps <= 0 and all(path in found for path in paths):
             break  # what comes behind need not lie alike
     return found
 
