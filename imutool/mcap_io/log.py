@@ -103,8 +103,9 @@ class Log:
 
     @property
     def imu_topics(self) -> list[str]:
-        """Topics with IMU messages, without those that imutool computed, and without single sensors of an IMU."""
-        return [t.name for t in self.with_schema((schemas.IMU,)) if not t.is_derived and PART_KEY not in t.metadata]
+        """IMU topics, none of them computed or part of another; silent ones only if all are."""
+        found = [t for t in self.with_schema((schemas.IMU,)) if not t.is_derived and PART_KEY not in t.metadata]
+        return [t.name for t in found if t.count] or [t.name for t in found]
 
     def only_imu(self) -> str:
         """The log's IMU, where there is exactly one.

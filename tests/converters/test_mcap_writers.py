@@ -76,3 +76,19 @@ def test_metadata_of_one_name_are_kept_and_attachments_are_a_loss(convert, tmp_p
     with (tmp_path / "out.mcap").open("rb") as file:
         found = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
     assert found["rig"] == {"camera": "left", "mount": "roof"}
+
+
+@pytest.mark.parametrize("options", [{}, {"use_statistics": False}])
+def test_an_imu_that_never_sent_a_message_is_no_choice(tmp_path, options):
+    """A recorder enters every topic that is offered."""
+    with (tmp_path / "in.mcap").open("wb") as file:
+        writer = Writer(file, **options)
+        writer.start("ros2")
+        schema = writer.register_schema(schemas.IMU, "ros2msg", schemas.definition(schemas.IMU).encode())
+        writer.register_channel("/spare/imu", "cdr", schema)
+        channel = writer.register_channel("/imu", "cdr", schema)
+        for t_ns, row in zip(T_NS.tolist(), encode_imu(T_NS, GYRO, ACCEL, "imu"), strict=True):
+            writer.add_message(channel, t_ns, row.tobytes(), t_ns)
+        writer.finish()
+    assert read(tmp_path / "in.mcap").imu_topic == "/imu"
+    assert len(read(tmp_path / "in.mcap", imu="/spare/imu").imu) == 0
