@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from functools import lru_cache
 
 XSENS_TIME = r"sample_?time_?fine"  # counts 100 us
@@ -214,3 +215,14 @@ def distinct_names(names: list[str]) -> list[str]:
             above = text
             distinct.append(text)
     return distinct
+
+
+def topic_of(column: str, taken: Collection[str], notes: list[str]) -> str:
+    """Topic of a column in Latin letters; a note where it does not show the column."""
+    name = re.sub(r"[^A-Za-z0-9_]+", "_", column).strip("_") or "column"
+    topic = f"/{name}" if name[0].isalpha() else f"/column_{name}"
+    if topic in taken or topic == "/column":  # of a name that differs by marks, or is in other letters
+        while topic in taken:
+            topic = f"{topic}_{len(taken)}"
+        notes.append(f"{column!r} is on {topic}")
+    return topic

@@ -44,6 +44,7 @@ from ._table_map import (
     within_groups,
 )
 from ._table_motion import settle_accel_unit
+from ._table_names import topic_of
 from ._table_packed import table_name
 from ._table_parts import load_table, recordings_in, refuse_joined
 from ._table_pose_names import why_no_poses
@@ -282,12 +283,11 @@ def _further(
         columns.remarks.losses.append(f"columns of another length, without a time, are left out: {', '.join(left[:20])}")
     if (over := len(clocks) - MOST_SCALARS) > 0:
         columns.remarks.losses.append(f"the table has {len(clocks)} further columns: {over} of them are left out")
-    scalars = {}
+    scalars: dict[str, Scalars] = {}
     for column, times_ns in list(clocks.items())[:MOST_SCALARS]:
         kept = in_order(times_ns, columns.values[column].astype(np.float64)[:, None], column)
         if len(kept.t_ns):
             unit = re.search(r"[\[(]([^\])]*)[\])]\s*$", column)
-            topic = re.sub(r"[^A-Za-z0-9_]+", "_", column).strip("_") or "column"
-            topic = f"/{topic}" if topic[0].isalpha() else f"/column_{topic}"
+            topic = topic_of(column, scalars, columns.remarks.notes)
             scalars[topic] = Scalars(kept.t_ns, kept.values, unit[1] if unit else "")
     return scalars, constants

@@ -138,8 +138,8 @@ def _spread_notes(moved_ns: Int64[np.ndarray, " n"], is_back: bool) -> list[str]
 def lost_to_set_back(t_ns: Int64[np.ndarray, " n"], name: str) -> list[str]:
     """Sentence on samples that have the times of others before them, where these are many."""
     lost = int((~_is_fresh(t_ns, np.diff(t_ns, prepend=t_ns[:1] - 1) != 0)).sum())
-    if lost <= MOST_SET_BACK * len(t_ns) or all(step_s > 0.0 for _, step_s in clock_jumps(t_ns)):
+    if lost <= MOST_SET_BACK * len(t_ns):
         return []
     what = f"{name}: {lost} of {len(t_ns)} samples are left out, as their time goes back to that of samples before them"
-    fix = "give each a table of its own, or add a column `trial` that tells them apart"
-    return [f"{what}; if the table holds several recordings, {fix}"]
+    fix = "; if the table holds several recordings, give each a table of its own, or add a column `trial` that tells them apart"
+    return [what + fix * any(step_s < 0.0 for _, step_s in clock_jumps(t_ns))]

@@ -610,3 +610,21 @@ def test_a_few_whole_numbers_are_no_gravity(tmp_path):
     counts = np.round(RNG.normal([0.0, -10.0, -4.0], 1.0, (COUNT, 3)))
     with pytest.raises(ConfigError, match="state no unit of the accel that imutool knows, and its values show none"):
         read(write_csv(tmp_path / "imu.csv", NAMES, [T_S, *counts.T, *(COUNTS / 16).T]))
+
+
+def test_further_columns_whose_names_have_the_same_latin_letters_are_topics_of_their_own(tmp_path):
+    more = {name: np.full(COUNT, float(n)) for n, name in enumerate(("温度", "湿度", "Mag X", "Mag.X"))}
+    names = ["time [s]", *(f"acc_{a} [g]" for a in "xyz"), *(f"gyro_{a} [deg/s]" for a in "xyz")]
+    log = read(write_csv(tmp_path / "imu.csv", [*names, *more], [T_S, *ACCEL_G.T, *COUNTS.T, *more.values()]))
+    found = {topic: scalars.values[0, 0] for topic, scalars in log.scalars.items()}
+    assert found == {"/column": 0.0, "/column_1": 1.0, "/Mag_X": 2.0, "/Mag_X_3": 3.0}
+    assert {"'湿度' is on /column_1", "'Mag.X' is on /Mag_X_3"} <= {*log.remarks.notes}
+
+
+def test_many_samples_that_come_late_by_less_than_a_second_are_a_loss(tmp_path):
+    names = ["Time (ms)", *(f"acc_{a} [g]" for a in "xyz"), *(f"gyro_{a} [deg/s]" for a in "xyz")]
+    log = read(write_csv(tmp_path / "imu.csv", names, [np.round(1000 * T_S) % 1000, *ACCEL_G.T, *COUNTS.T]))
+    assert len(log.imus["/imu0"]) == 100
+    assert log.remarks.losses == [
+        "/imu0: 200 of 300 samples are left out, as their time goes back to that of samples before them"
+    ]
