@@ -20,7 +20,7 @@ from imutool.errors import ConfigError, DataError, did_you_mean
 from imutool.recording.message_log import KINDS
 
 from ._table_text import Columns
-from ._table_times import COUNTED
+from ._table_times import COUNTED, without_overflow
 from ._table_units import TIME_NS, UNITS_OF
 
 IMU_TOPIC = "/imu0"
@@ -270,7 +270,7 @@ def times_named(columns: Columns, wanted: str, unit: str, where: Path) -> Int64[
     if values.dtype.kind in "iu":
         if len(values) and int(values.max()) > LARGEST_NS // int(size):
             raise DataError(f"{wanted} reaches {values.max()} {unit}", where=where, expected="a time before the year 2262")
-        return values.astype(np.int64) * int(size)
+        return without_overflow(values, wanted, columns.remarks.notes) * int(size)
     if (texts := columns.texts.get(wanted)) is not None:
         try:
             return np.array([int((Decimal(text) * int(size)).to_integral_value()) for text in texts], np.int64)

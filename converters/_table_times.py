@@ -39,6 +39,7 @@ DAY_NS = 86_400 * NS
 SERIAL_DAYS = {"Excel": 25_569, "MATLAB": 719_529}  # days of their calendars at the start of 1970
 FIRST_DAY, LAST_DAY = 10_957, 47_482  # of 2000 and of 2100, since 1970
 WORD_SIZES = 2**8, 2**16, 2**32  # at which a counter begins again
+MOST_OF_WORD = 0.9  # of its size, by which a counter falls where it begins again
 SIZES = *(2**k for k in range(4, 33)), *(10**k for k in range(10)), 24, 60, 3600, 86_400  # at which a time or a counter does
 LEAST_ROWS = 20  # of a recording, in the mean
 
@@ -265,6 +266,18 @@ def _unwrapped(counts: np.ndarray) -> Float64[np.ndarray, " n"]:
     values = counts.astype(np.float64)
     size = next((size for size in WORD_SIZES if values.max(initial=0.0) < size), 2**53)
     return np.concatenate([[0.0], np.cumsum(np.diff(values) % size)])
+
+
+def without_overflow(values: np.ndarray, name: str, notes: list[str]) -> Int64[np.ndarray, " n"]:
+    """Whole numbers of a time that go on where a counter of 32 bits begins again."""
+    t: Int64[np.ndarray, " n"] = values.astype(np.int64)
+    falls = np.diff(t) < -MOST_OF_WORD * WORD_SIZES[-1]
+    if not falls.any() or t.min() < 0 or t.max() >= WORD_SIZES[-1]:
+        return t
+    note = f"{name!r} begins again at 2^32 ({int(falls.sum())} times): its times go on there"
+    notes += [note] if note not in notes else []
+    t[1:] += WORD_SIZES[-1] * np.cumsum(falls)
+    return t
 
 
 def begun_at_zero(log: MessageLog) -> MessageLog:

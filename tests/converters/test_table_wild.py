@@ -628,3 +628,13 @@ def test_many_samples_that_come_late_by_less_than_a_second_are_a_loss(tmp_path):
     assert log.remarks.losses == [
         "/imu0: 200 of 300 samples are left out, as their time goes back to that of samples before them"
     ]
+
+
+def test_a_counter_of_32_bits_goes_on_where_it_begins_again(tmp_path):
+    """`micros()` of a board does so after 71 minutes."""
+    names = ["time_us", *(f"acc_{a} [g]" for a in "xyz"), *(f"gyro_{a} [deg/s]" for a in "xyz")]
+    t_us = 2**32 - 1_000_000 + 10_000 * np.arange(COUNT)
+    log = read(write_csv(tmp_path / "imu.csv", names, [t_us % 2**32, *ACCEL_G.T, *COUNTS.T]))
+    assert log.imus["/imu0"].t_ns.tolist() == (1000 * t_us).tolist()
+    assert log.remarks.losses == []
+    assert log.remarks.notes.count("'time_us' begins again at 2^32 (1 times): its times go on there") == 1
