@@ -138,15 +138,15 @@ class Command(TyperCommand):
         places, resume = {name: values[name] for name in marks if values[name] != "-"}, bool(values.get("resume"))
         places |= {name: f"{place}/" for name, place in places.items() if isinstance(place, Path) and meta.get(FOLDERS + name)}
         wanted = [
-            replace(marks[name], parameter=name, place=place, keeps=marks[name].keeps or (resume and _is_report(place)))
+            replace(marks[name], parameter=name, place=place, keeps=marks[name].keeps or (resume and self._is_report(place)))
             for name, place in places.items()
         ]
         check_outputs(wanted, [values[name] for name in values if name not in marks], overwrite=bool(values.get("overwrite")))
 
-
-def _is_report(place: str | Path | None) -> bool:
-    """Whether a file is a JSON report of imutool."""
-    return b'"schema": "imutool.' in first_bytes(Path(place or ""), 200)  # the schema comes first
+    def _is_report(self, place: str | Path | None) -> bool:
+        """Whether a file is a JSON report of a run that --resume can go on with."""
+        kind = b"training" if self.name == "train" else b"fleet"
+        return b'"schema": "imutool.%s/' % kind in first_bytes(Path(place or ""), 200)  # the schema comes first
 
 
 class App(typer.Typer):
