@@ -22,7 +22,7 @@ from typer.models import CommandFunctionType
 from imutool import __version__, registry
 from imutool.cli.overview import ABOUT, show
 from imutool.cli.parameters import FOLDERS, PlainValue, current, error_with_flags, flags, instead_of, with_flags
-from imutool.cli.terminal import log_to_stderr, plain, progress, say, tell_error, write_json
+from imutool.cli.terminal import log_to_stderr, plain, progress, say, stdout_for_one, tell_error, write_json
 from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact, was_interrupted
 from imutool.file_location import first_bytes
 from imutool.mcap_io.storage import output_conflicts
@@ -120,11 +120,11 @@ class Command(TyperCommand):
         Raises:
             ImutoolError: the command failed.
         """
-        flag_of = flags(self)
-        current.set(flag_of)
+        current.set(flag_of := flags(self))
         try:
             self._check(ctx.params, ctx.meta)
-            return super().invoke(ctx)
+            with stdout_for_one({name: ctx.params[name] for name in written(type(self).function)}):
+                return super().invoke(ctx)
         except ImutoolError as error:
             values = ctx.params.values()
             typed = {str(word) for value in values for word in (value if isinstance(value, (list, tuple)) else (value,))}
