@@ -31,7 +31,7 @@ from imutool.file_location import Location, local
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
-from imutool.mcap_io.storage.target import writing
+from imutool.mcap_io.storage.target import Target, writing
 from imutool.noise import datasheet
 from imutool.processes.forked import Forked
 from imutool.report import json_text
@@ -58,7 +58,7 @@ def refuse(folder: Path, *, overwrite: bool = False) -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise ConfigError("is a file", where=folder, expected="a folder, which need not exist")
-    existing = [name for name in FILES if (folder / name).exists()]
+    existing = [name for name in (*FILES, CLOSED) if (folder / name).exists()]
     if existing and not overwrite:
         raise ConfigError(
             f"holds a diagnosis already ({', '.join(existing)})", where=folder, fix="Choose another folder, or give `overwrite`"
@@ -209,7 +209,8 @@ def _closed(
     except ImutoolError as error:  # for a figure no diagnosis is thrown away
         figures, first = None, replace(first, remarks=(*first.remarks, f"The metric is not compared: {error}"))
     done = replace(first, closed=closed_loop(first, again, log, metric=figures, rounds=number))
-    (folder / FINDINGS).write_text(json_text(done.report), encoding="utf-8")
+    with Target(folder / FINDINGS, overwrite=True) as findings:
+        findings.write(json_text(done.report).encode())
     if find_spec("matplotlib") is not None:
         from imutool.viewing.html.diagnosis_page import write as write_page
 

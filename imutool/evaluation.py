@@ -44,7 +44,7 @@ from imutool.recording import Imu, Poses, Recording, nanoseconds
 
 logger = logging.getLogger(__name__)
 
-RAW = "raw"
+RAW, TRUTH = "raw", "truth"  # also of files of trajectories
 DRIFT_S = 5.0
 DELAY_WINDOW_S = 1.0  # of the windows that show a delay of the poses
 CLEAR_STDS, MOST_DRIFT_LEFT = 4.0, 0.9  # of a clear delay: deviations, and share of the drift that is left without it
@@ -160,7 +160,7 @@ def _evaluated(
             scores.append(of | how | {"fit": fit and to_builtins(fit)} | metrics.evaluate(estimate, true, valid))
             if trajectories is not None:
                 if (name, kind) == (RAW, PURE):
-                    metrics.write_trajectory(true.rows(valid), trajectories, recording.name, "truth", overwrite)
+                    metrics.write_trajectory(true.rows(valid), trajectories, recording.name, TRUTH, overwrite)
                 label = name if kind == PURE else f"{name}_{kind}"
                 metrics.write_trajectory(estimate.rows(valid), trajectories, recording.name, label, overwrite)
         del estimates, estimate
@@ -291,8 +291,8 @@ def _model_and_start(
 
 
 def _refuse_twins(models: Sequence[str | Path]) -> None:
-    """Two models of one name would write one file."""
-    names = [Path(model).stem for model in models]
+    """Two trajectories of one name would be one file; those of the samples and of the truth have names, too."""
+    names = [RAW, TRUTH, *(Path(model).stem for model in models)]
     for name in names:
         if names.count(name) > 1:
-            raise ConfigError(f"two models are called {name!r}", where="trajectories", fix="Rename one of the files")
+            raise ConfigError(f"two trajectories are called {name!r}", where="trajectories", fix="Rename a model's file")

@@ -15,6 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support import driven
 from support.evo import statistics
+from typer.testing import CliRunner
 
 from imutool import evaluation
 from imutool.bias import linear
@@ -23,6 +24,7 @@ from imutool.bias_start.correction import apply_with_std
 from imutool.bias_start.initial_bias import LEAST_STD
 from imutool.bias_start.model_choice import find_initial_bias
 from imutool.bias_start.prior_width import BiasPrior
+from imutool.cli import load
 from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, DataError, LogError, ModelError
@@ -409,6 +411,22 @@ def test_trajectories_are_not_written_over_unless_told(log: Path, tmp_path: Path
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.parametrize("name", ["raw", "truth"])
+def test_a_model_cannot_take_the_place_of_the_truth(log: Path, tmp_path: Path, name: str) -> None:
+    with pytest.raises(ConfigError, match=f"two trajectories are called '{name}'"):
+        evaluate(log, models=[tmp_path / f"{name}.safetensors"], trajectories=tmp_path, overwrite=True)
+
+
+def test_of_two_logs_of_one_name_none_is_written_over(log: Path, tmp_path: Path) -> None:
+    """As a raw log and the debiased one of it have; the second one's trajectories took the place of the first one's."""
+    (tmp_path / "b.mcap").symlink_to(log)
+    words = ["evaluate", str(log), str(tmp_path / "b.mcap"), "--trajectories", str(tmp_path / "tum"), "--overwrite"]
+    done = CliRunner().invoke(load(), words)
+    assert done.exit_code == ConfigError.exit_code
+    assert f"--trajectories: {log} and {tmp_path}/b.mcap are both called" in done.stderr
+    assert not (tmp_path / "tum").exists()
+
+
 def test_a_logs_name_cannot_lead_out_of_the_folder(recording: Recording, tmp_path: Path) -> None:
     """The name comes from the log, and the log from anybody."""
     for i, name in enumerate(("../../outside", "/tmp/outside", "a/b", "..")):
@@ -425,7 +443,7 @@ def test_one_name_for_two_models_is_refused_before_anything_is_written(log: Path
     twin = tmp_path / "other" / model.name
     twin.parent.mkdir()
     twin.write_bytes(model.read_bytes())
-    with pytest.raises(ConfigError, match="two models are called 'linear_1'"):
+    with pytest.raises(ConfigError, match="two trajectories are called 'linear_1'"):
         evaluate(log, models=[model, twin], init="truth", trajectories=tmp_path / "tum", overwrite=True)
     assert not (tmp_path / "tum").exists()
 

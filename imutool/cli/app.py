@@ -22,7 +22,7 @@ from typer.models import CommandFunctionType
 from imutool import __version__, registry
 from imutool.cli.overview import ABOUT, show
 from imutool.cli.parameters import FOLDERS, PlainValue, current, error_with_flags, flags, instead_of, with_flags
-from imutool.cli.terminal import log_to_stderr, plain, progress, say, tell_error, write_json
+from imutool.cli.terminal import log_to_stderr, plain, progress, say, stdout_for_one, tell_error, write_json
 from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact, was_interrupted
 from imutool.file_location import first_bytes
 from imutool.mcap_io.storage import output_conflicts
@@ -120,11 +120,11 @@ class Command(TyperCommand):
         Raises:
             ImutoolError: the command failed.
         """
-        flag_of = flags(self)
-        current.set(flag_of)
+        current.set(flag_of := flags(self))
         try:
             self._check(ctx.params, ctx.meta)
-            return super().invoke(ctx)
+            with stdout_for_one({name: ctx.params[name] for name in written(type(self).function)}):
+                return super().invoke(ctx)
         except ImutoolError as error:
             values = ctx.params.values()
             typed = {str(word) for value in values for word in (value if isinstance(value, (list, tuple)) else (value,))}
@@ -138,15 +138,15 @@ class Command(TyperCommand):
         places, resume = {name: values[name] for name in marks if values[name] != "-"}, bool(values.get("resume"))
         places |= {name: f"{place}/" for name, place in places.items() if isinstance(place, Path) and meta.get(FOLDERS + name)}
         wanted = [
-            replace(marks[name], parameter=name, place=place, keeps=marks[name].keeps or (resume and _is_report(place)))
+            replace(marks[name], parameter=name, place=place, keeps=marks[name].keeps or (resume and self._is_report(place)))
             for name, place in places.items()
         ]
         check_outputs(wanted, [values[name] for name in values if name not in marks], overwrite=bool(values.get("overwrite")))
 
-
-def _is_report(place: str | Path | None) -> bool:
-    """Whether a file is a JSON report of imutool."""
-    return b'"schema": "imutool.' in first_bytes(Path(place or ""), 200)  # the schema comes first
+    def _is_report(self, place: str | Path | None) -> bool:
+        """Whether a file is a JSON report of a run that --resume can go on with."""
+        kind = b"training" if self.name == "train" else b"fleet"
+        return b'"schema": "imutool.%s/' % kind in first_bytes(Path(place or ""), 200)  # the schema comes first
 
 
 class App(typer.Typer):

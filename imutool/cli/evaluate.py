@@ -14,7 +14,7 @@ from msgspec import convert, field
 from imutool.bias_start import Fitness
 from imutool.cli.app import COMMON, Aid, Common, Imu, Init, Logs, Models, ReportPage, Set, Smooth, Truth, Written, app
 from imutool.cli.terminal import figures, say, table
-from imutool.errors import ImutoolError
+from imutool.errors import ConfigError, ImutoolError
 from imutool.report import UNSET, Report, Section, UnsetType
 
 logger = logging.getLogger(__name__)
@@ -100,6 +100,8 @@ def evaluate(
     """
     from imutool.evaluation import evaluate as run
 
+    if trajectories is not None and len(logs) > 1:
+        _refuse_twins(logs)
     if report is not None:
         from imutool.viewing.html import report as pages
         from imutool.viewing.html.drawing import require_matplotlib
@@ -135,6 +137,23 @@ def evaluate(
         logger.warning("%s", error)
     if errors:
         raise errors[0]
+
+
+def _refuse_twins(logs: Sequence[Path]) -> None:
+    """Refuse two logs of one name, before any work: they would write the same trajectories (ConfigError)."""
+    from imutool.file_location import log_name
+    from imutool.mcap_io.log import Log
+    from imutool.mcap_io.write import own_and_user_metadata
+
+    known: dict[str, Path] = {}
+    for path in logs:
+        with Log(path) as log:
+            own, _ = own_and_user_metadata(log.metadata_records(), "")
+        name = own.get("name", log_name(path))
+        if name in known:
+            what = f"{known[name]} and {path} are both called {name!r}"
+            raise ConfigError(what, where="trajectories", fix="Score them one at a time, each with a folder of its own")
+        known[name] = path
 
 
 def _fits(results: Sequence[dict[str, Any]]) -> list[str]:

@@ -73,6 +73,7 @@ def _run(
             overwrite=common.overwrite,
             recheck=recheck,
             page=page,
+            json_to=None if common.json_to in (None, "-") else to_location(common.json_to),
             tell=tell,
         )
     if not common.write(done.summary(), replace=resume):

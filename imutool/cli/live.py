@@ -68,6 +68,8 @@ def live(
     origin = source or log
     if origin is None or (source and log):
         raise ConfigError("one source is needed", where="live", expected="a log, or --from SOURCE")
+    if to_stdout and common.json_to == "-":
+        raise ConfigError("--print and --json - both go to stdout", where="live", fix="Give --json a file")
     found = load_model(model)
     channel = scale_of(found).channel if found.temperature_parameters() else None
     samples = open_source(origin, malformed, imu=imu, speed=speed, temperature=channel)

@@ -8,13 +8,13 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from imutool.cli.parameters import with_flags
-from imutool.errors import redact
+from imutool.errors import ConfigError, redact
 from imutool.file_location import to_location
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.storage.target import Target
@@ -27,6 +27,7 @@ LONGEST = 2000  # letters of an error message
 LONGEST_ROW = 10_000  # letters of a table's row where nobody looks at a terminal
 NUMBER = re.compile(r"[-+]?[0-9.]+|[–?]")
 MISSING = "–"  # in the place of a figure
+STDOUT = "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"
 
 logger = logging.getLogger("imutool")
 
@@ -52,6 +53,19 @@ def say(line: str, word: str = "", color: str = "yellow", *, to: Console = out) 
     """Print a line of results, behind a coloured word if one is given; never folded."""
     marked = f"[{color}]{word}:[/] " if word else ""
     to.print(f"{marked}{plain(line)}", highlight=False, soft_wrap=True)
+
+
+def stdout_for_one(outputs: Mapping[str, Any]) -> AbstractContextManager[Any]:
+    """Lines of results on stderr while an output is written to stdout, by its name as a device.
+
+    Raises:
+        ConfigError: two outputs go there.
+    """
+    named = [name for name, place in outputs.items() if str(place) in STDOUT or (name, place) == ("json_to", "-")]
+    if len(named) > 1:
+        what = f"`{named[0]}` and `{named[1]}` both go to stdout"
+        raise ConfigError(what, where=outputs[named[0]], fix="Give one of them a file")
+    return redirect_stdout(sys.stderr) if named and outputs[named[0]] != "-" else nullcontext()
 
 
 def tell_error(message: str) -> None:

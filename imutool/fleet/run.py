@@ -22,7 +22,7 @@ from imutool.fleet.one_log import write_json
 from imutool.fleet.results import FleetSummary, LogProblem
 from imutool.fleet.robots import Comparison, compare
 from imutool.fleet.sources import Found, find, with_simulations
-from imutool.fleet.targets import page_name, partial_files, remove_files, target_name
+from imutool.fleet.targets import page_name, partial_files, refuse_own, remove_files, target_name
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task, failed
 from imutool.report import UNSET
 
@@ -122,13 +122,16 @@ def run(
     overwrite: bool = False,
     recheck: bool = False,
     page: Location | None = None,
+    json_to: Location | None = None,
     tell: Tell = lambda done, total, words: None,
 ) -> FleetReport:
     """Run a command on every log of `source`; write the results and fleet.parquet to `out`.
 
+    The caller writes the summary to `json_to`.
+
     Raises:
         ConfigError: no logs; an `out` that holds results already, or cannot be written; a page that exists (without `overwrite`
-            or `resume`); no engine.
+            or `resume`), or is the file of a result, as is `json_to`; no engine.
         KeyboardInterrupt: the message says how to go on; no partial file is left.
     """
     began = time.perf_counter()
@@ -141,6 +144,7 @@ def run(
     found = with_simulations(logs, settings.sim)
     progress = Progress(len(found.logs) + len(found.refused), sum(source.size for source in found.logs))
     fleet = _Fleet(found, target, settings, overwrite, recheck)
+    refuse_own(target, fleet.names(), page=page, json_to=json_to)
 
     def tick(flying: int) -> None:
         tell(progress.bytes_done, progress.total_bytes, progress.line(flying))
@@ -198,9 +202,13 @@ class _Fleet:
 
     def remove_partial(self) -> None:
         """Remove the partial files of a killed run."""
+        remove_files(partial_files(self.out, self.names()))
+
+    def names(self) -> list[str]:
+        """Names below OUT of all results, of their pages, and of what compares them."""
         names = [self._name(source) for source in self.found.logs]
         pages = [page_name(name) for name in names] if self.settings.pages else []
-        remove_files(partial_files(self.out, [*names, *pages]))
+        return [*names, *pages, *([COMPARED] if self.settings.command == "diagnose" else [])]
 
     def refused(self, journal: Journal) -> Iterator[Result]:
         """Results of refused logs: an unusable name, or a target that no fleet has written."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -58,6 +59,25 @@ def within(out: Location, name: str) -> Location:
         if not real.is_relative_to(out.resolve()):
             raise ConfigError(f"leads to {real}, outside OUT", where=target.parent, fix="Remove the link")
     return target
+
+
+def refuse_own(out: Location, names: Iterable[str], **outputs: Location | None) -> None:
+    """Refuse an output that would take the place of one of these files below OUT.
+
+    Raises:
+        ConfigError: with the parameter of the output.
+    """
+    folder = f"{_real(out).rstrip('/')}/"
+    files = {_real(place): parameter for parameter, place in outputs.items() if place is not None}
+    below = {file.removeprefix(folder): parameter for file, parameter in files.items() if file.startswith(folder)}
+    own = next((name for name in names if name in below), None) if below else None
+    if own is not None:
+        what = f"`{below[own]}` would replace a file of the fleet's own"
+        raise ConfigError(what, where=out / own, expected="another name than those of its results")
+
+
+def _real(place: Location) -> str:
+    return os.path.realpath(place) if isinstance(place, Path) else str(place)
 
 
 def target_name(name: str, command: str) -> str:

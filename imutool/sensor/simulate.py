@@ -19,6 +19,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.errors import ConfigError, DataError, ImutoolError, LogError
+from imutool.file_location import same_location
 from imutool.geometry import quaternion
 from imutool.log_info.convention_report import check_poses
 from imutool.mcap_io.codec.decode import PoseBatch
@@ -112,7 +113,7 @@ def simulate(
     file = PhysicsFile() if physics is None else physics_file.read(physics)
     acting = file.acting(where=physics or "physics")
     sheet = noises.read(noise)
-    if out.exists() and out.samefile(trajectory):
+    if same_location(out, trajectory):
         raise ConfigError("is the trajectory itself", where=out, expected="another OUT")
     _check(rate_hz, seed)
     report(0, 2, "simulating")

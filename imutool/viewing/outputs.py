@@ -133,7 +133,7 @@ class Outputs:
         if (page := self.asked.html) is not None:
             yield _page(logs, page, self.asked.overwrite)
         if (folder := self.asked.png) is not None:
-            for data in logs:
+            for data in report.with_unique_names(logs):
                 paths = report.write_pngs(data, folder, overwrite=self.asked.overwrite)
                 listed = ", ".join(map(str, paths))
                 yield Output("png", str(folder), f"Drew {listed}" if paths else f"There is nothing to draw of {data.name}")

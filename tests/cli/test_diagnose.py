@@ -297,6 +297,14 @@ def test_other_files_in_the_folder_stay(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "findings.json").read_text()) == json_values(diagnoses.ARM.report)
 
 
+def test_a_page_of_somebody_else_stays(tmp_path: Path) -> None:
+    """It was removed, as if it were of a diagnosis that is replaced."""
+    (tmp_path / diagnosis_output.CLOSED).write_text("mine")
+    with pytest.raises(ConfigError, match=r"holds a diagnosis already \(closed\.html\)"):
+        diagnosis_output.write(diagnoses.NOTHING, tmp_path)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(diagnosis_output.CLOSED, "mine")]
+
+
 def test_an_absent_extra_costs_its_file_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     diagnosis_output.write(diagnoses.ARM, tmp_path / "out")
     monkeypatch.setitem(sys.modules, "rerun", None)

@@ -24,6 +24,7 @@ from imutool.errors import ConfigError
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 
 Refused = Callable[..., str]
+MAGIC = b"\x89MCAP0\r\n"
 
 USAGE, CONFIG, LOG = 2, 3, 5
 
@@ -299,6 +300,23 @@ def test_a_device_or_a_pipe_is_written_to_and_never_replaced(
         assert "imutool." in got[0]
     assert stat.S_ISCHR(Path("/dev/null").stat().st_mode)
     assert sorted(path.name for path in tmp_path.iterdir()) == (["fifo"] if where == "fifo" else [])
+
+
+def test_an_output_has_stdout_for_itself(logs: Path) -> None:
+    """The summary stood behind the log, which then ended in bytes that are no record."""
+    executable = Path(typer.__file__).parents[4] / "bin" / "imutool"
+    repair = [executable, "repair", logs / "flight_1.mcap", "/dev/stdout"]
+    done = subprocess.run(repair, capture_output=True, timeout=120, check=False)
+    assert (done.returncode, done.stdout[:8], done.stdout[-8:]) == (0, MAGIC, MAGIC)
+    assert b"/dev/stdout: " in done.stderr
+    done = subprocess.run([*repair, "--json", "-"], capture_output=True, timeout=120, check=False)
+    assert (done.returncode, done.stdout) == (CONFIG, b"")
+    assert b"both go to stdout" in done.stderr
+
+
+def test_samples_and_a_report_are_not_mixed(refused: Refused) -> None:
+    said = refused(CONFIG, "live", "--from", "in.mcap", "--no-view", "--print", "--json", "-")
+    assert "--print and --json - both go to stdout" in said
 
 
 def test_a_mark_is_found_in_an_annotation() -> None:

@@ -438,6 +438,40 @@ def test_page_and_report_may_lie_in_an_out_that_is_not_there_yet(fleet: Path, tm
     assert {"page.html", "report.json"} <= {path.name for path in out.iterdir()}
 
 
+@pytest.mark.parametrize(
+    ("command", "option", "name"),
+    [
+        ("info", "--json", "robot_a/log.json"),
+        ("debias --pages", "--report", "robot_a/log.html"),
+        ("diagnose --no-search", "--json", "fleet.json"),
+    ],
+)
+def test_the_summary_and_the_page_cannot_take_the_place_of_a_result(
+    fleet: Path, tmp_path: Path, command: str, option: str, name: str
+) -> None:
+    """The page did; the summary was refused after all the work, and on --resume it did, too."""
+    (tmp_path / "link").symlink_to(tmp_path / "out")
+    (tmp_path / "out" / "robot_a").mkdir(parents=True)
+    words = ["fleet", *command.split(), str(fleet), str(tmp_path / "out"), option, str(tmp_path / "link" / name)]
+    done = CliRunner().invoke(load(), words)
+    assert done.exit_code == ConfigError.exit_code
+    assert f"{tmp_path}/out/{name}: {option} would replace a file of the fleet's own" in done.stderr
+    assert not (tmp_path / "out" / NAME).exists()
+
+
+def test_resume_replaces_only_the_summary_of_a_fleet(fleet: Path, tmp_path: Path) -> None:
+    """It replaced any report of imutool, such as the findings of a diagnosis."""
+    precious = tmp_path / "findings.json"
+    precious.write_text('{\n  "schema": "imutool.diagnosis/1"')
+    words = ["fleet", "info", str(fleet), str(tmp_path / "out"), "--resume", "--json", str(precious)]
+    done = CliRunner().invoke(load(), words)
+    assert done.exit_code == ConfigError.exit_code
+    assert "findings.json: the target exists" in done.stderr
+    precious.unlink()
+    assert CliRunner().invoke(load(), words).exit_code == 0
+    assert CliRunner().invoke(load(), words).exit_code == 0
+
+
 class Inline:
     """The work done here and now: for what has nothing to do with workers."""
 

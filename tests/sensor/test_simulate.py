@@ -344,6 +344,12 @@ def test_the_trajectory_is_never_overwritten(trajectory: Path) -> None:
     assert trajectory.read_bytes() == before
 
 
+def test_a_missing_trajectory_is_told_alike_where_out_exists(tmp_path: Path) -> None:
+    (tmp_path / "out.mcap").touch()
+    with pytest.raises(ConfigError, match=r"none\.mcap: cannot be opened"):
+        simulate(tmp_path / "none.mcap", tmp_path / "out.mcap", overwrite=True)
+
+
 def test_the_command_reports_and_refuses(imutool: Run, trajectory: Path, tmp_path: Path) -> None:
     (tmp_path / "physics.toml").write_text(LEVER)
     done = imutool(

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.viewing import outputs
+from imutool.viewing.html.report import file_name
 from imutool.viewing.model.load_view import build
 from imutool.viewing.model.run_data import Run, RunData
 from imutool.viewing.outputs import Outputs, RequestedOutputs, cursor_s
@@ -57,6 +59,16 @@ def test_files_and_pages_are_made_together_and_each_is_said(data: RunData, tmp_p
     assert (tmp_path / "a.rrd").stat().st_size > 1000
     assert shown[1].said == f"Drew {tmp_path / 'p' / 'flight_3-paths.png'}"
     assert all(one.place in one.said for one in shown)
+
+
+@pytest.mark.parametrize("name", ["flight 1", "flight_1" * 20])
+def test_pictures_of_two_logs_of_one_name_have_two_names(data: RunData, tmp_path: Path, report: None, name: str) -> None:
+    """As of a raw log and the debiased one of it; the second one's took the place of the first one's."""
+    twins = [replace(data, name=name), replace(data, name=name.replace(" ", "_"))]
+    with Outputs(RequestedOutputs(png=tmp_path)) as views:
+        first, second = views.show(twins)
+    assert first.said == f"Drew {tmp_path / name}-paths.png"
+    assert file_name(second.said.removeprefix(f"Drew {tmp_path}/")) != file_name(first.said.removeprefix(f"Drew {tmp_path}/"))
 
 
 def test_without_rerun_a_page_is_written_here_and_said(

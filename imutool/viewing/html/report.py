@@ -133,6 +133,16 @@ def file_name(name: str) -> str:
     return re.sub(r"[^\w.+-]", "_", name).lstrip(".-")[:100] or "_"
 
 
+def with_unique_names(logs: Sequence[RunData]) -> list[RunData]:
+    """Number logs whose files would have one name, such as a raw log and the debiased one of it."""
+    named: dict[str, RunData] = {}
+    for data in logs:
+        names = (data.name, *(f"{data.name[:80]} {number}" for number in range(2, len(logs) + 1)))
+        name = next(name for name in names if file_name(name) not in named)
+        named[file_name(name)] = replace(data, name=name)
+    return list(named.values())
+
+
 def name_by_topic(logs: Sequence[RunData], topics: Sequence[str]) -> list[RunData]:
     """Name several IMUs of one log by their topics too; a single one keeps the log's name."""
     if len(logs) < 2:

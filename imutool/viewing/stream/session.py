@@ -26,7 +26,7 @@ from imutool.errors import DataError
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording.columns import clock_jumps, jump_warnings
 from imutool.viewing.stream import Delay, StreamStatistics
-from imutool.viewing.stream.samples import Malformed, Sample
+from imutool.viewing.stream.samples import MOST_NS, Malformed, Sample
 from imutool.viewing.stream.sources import Samples, timely
 from imutool.viewing.stream.stream_fit import STREAM, SWITCH_S, StreamFit, check_first, imu_of
 
@@ -165,7 +165,7 @@ class _Session:
             self._out_of_order += 1
         elif step_ns > GAP_S * 1e9:
             self._gaps += 1
-        self._last_ns = found.stamp_ns if jumps else max(self._last_ns, found.stamp_ns)
+        self._last_ns = max(self._last_ns, found.stamp_ns) if self._samples and not jumps else found.stamp_ns
         self._samples += 1
         return bool(jumps)
 
@@ -270,7 +270,7 @@ def _showing(show: Show | None) -> Iterator[_Batches]:
 
 def _show_all(batches: Iterable[list[tuple[Sample, np.ndarray, np.ndarray]]], show: Show) -> None:
     """Show each batch; samples that are not newer than those before, or not measured, are left out."""
-    last_ns, count = -1, 0
+    last_ns, count = -MOST_NS - 1, 0
     for batch in batches:
         rows = []
         for row in batch:

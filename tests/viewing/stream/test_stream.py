@@ -183,6 +183,18 @@ def test_one_stray_stamp_does_not_end_the_wait_for_the_start(imu: Imu, stray_ns:
     assert "the clock jumps" in caplog.text
 
 
+def test_a_clock_that_begins_below_zero_does_not_jump(imu: Imu, caplog: pytest.LogCaptureFixture) -> None:
+    """As one that counts to an event; its seconds were counted from zero, and nothing of it was shown."""
+    early = [found._replace(stamp_ns=found.stamp_ns - int(imu.t_ns[0]) - 10**15) for found in stream(imu)]
+    shown: list[int] = []
+    done = run(
+        iter(early), api.load_model("static"), Malformed(), show=lambda block: shown.extend(block.batch.stamp_ns.tolist())
+    )
+    assert (done.seconds, done.gaps) == (pytest.approx(8.0), 0)
+    assert shown == [found.stamp_ns for found in early]
+    assert "the clock jumps" not in caplog.text
+
+
 def test_a_clock_that_jumps_at_each_sample_does_not_delay_the_start_for_ever(imu: Imu, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "MOST_FIRST", 100)
     corrected: list[int] = []
