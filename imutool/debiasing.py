@@ -101,7 +101,8 @@ class Debiaser:
         self.source_topic, self._watch = source_topic, watch
         self._clean = None if found is None else Cleaner(found)
         self.topics = new_topics(source_topic)
-        self._estimator, self._start_ns, self._model = BiasEstimator(model, start), -1, model
+        self._estimator, self._model = BiasEstimator(model, start), model
+        self._start_ns: int | None = None
         self.sieve = Sieve(source_topic)
         self._white = np.diag(np.where(model.noise_std > 0, model.noise_std, start.noise) ** 2)
 
@@ -116,9 +117,8 @@ class Debiaser:
         if self._clean is not None:
             batch = self._clean(batch)
         batch, t_ns = self.sieve(batch)
-        if self._start_ns < 0 and len(t_ns):
-            self._start_ns = int(t_ns[0])
-        t_s = seconds(t_ns, self._start_ns)
+        self._start_ns = int(t_ns[0]) if self._start_ns is None and len(t_ns) else self._start_ns
+        t_s = seconds(t_ns, self._start_ns or 0)
         gyro, accel = rows_without_drift(self._model, batch.stamp_ns, batch.gyro, batch.accel)
         bias, covariance = with_drift(self._model, batch.stamp_ns, *self._estimator(t_s, gyro, accel))
         if not (np.isfinite(bias).all() and np.isfinite(covariance).all()):

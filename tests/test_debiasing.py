@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import tracemalloc
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import torch
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
+from support.imu_defects import batch_of, cut
 from support.two_imus import write_two_imus
 
 from imutool.bias.model import BiasModel
@@ -32,7 +34,7 @@ from imutool.bias_start.model_choice import estimate_at_rest
 from imutool.cleaning import CleaningSettings
 from imutool.cli.debias import assigned
 from imutool.conversion.run import convert
-from imutool.debiasing import debias
+from imutool.debiasing import Debiaser, debias
 from imutool.errors import ConfigError, LogError, ModelError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu, decode_scalars
@@ -652,6 +654,18 @@ def test_ctrl_c_in_the_middle_leaves_nothing(source: Path, model_file: Path, tmp
     with pytest.raises(KeyboardInterrupt):
         debias(source, tmp_path / "out.mcap", model=model_file, progress=stop)
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("first_s", [0.0, -100.0, -1.0])
+def test_stamps_before_1970_change_no_bias(recording: Recording, first_s: float) -> None:
+    """Of a clock that counts down to a start, as in ROS 2, whose seconds have a sign; in several batches."""
+    model, imu, out = make_model("neural_ode"), recording.imu.rows(slice(0, 1500)), list[np.ndarray]()
+    imu = replace(imu, t_ns=imu.t_ns - imu.t_ns[0] + round(1e9 * first_s))
+    start = tracked_from_prior(model)
+    debiaser = Debiaser("/imu0", model, start, watch=lambda block: out.append(block.bias))
+    for part in cut(batch_of(imu), [400, 700, 1100]):
+        debiaser(part)
+    np.testing.assert_allclose(np.concatenate(out), apply(model, start, imu).bias, rtol=0, atol=ONLINE)
 
 
 # ── one sample at a time ─────────────────────────────────────────────────────────────────────────────────────────────

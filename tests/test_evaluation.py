@@ -376,6 +376,15 @@ def test_a_gap_of_the_imu_is_warned_of(recording: Recording, tmp_path: Path, cap
     assert caplog.text.count("gaps of the IMU: 1, 2.5 s in all, the first at ") == 1
 
 
+def test_poses_a_second_apart_are_warned_of(recording: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Between its poses the truth that is scored is interpolated."""
+    topic, truth = next(iter(recording.truths.items()))
+    every = round(1.0 / truth.period_s)
+    write(replace(recording, truths={topic: truth.rows(slice(None, None, every))}), tmp_path / "sparse.mcap")
+    evaluate(tmp_path / "sparse.mcap")
+    assert [r.message for r in caplog.records if f"{topic} are 1 s apart, and interpolation between them" in r.message]
+
+
 def test_the_truth_that_is_named_gives_start_and_score(recording: Recording, tmp_path: Path) -> None:
     """A second truth, turned by ten degrees and moved: against the wrong start the raw error would show it."""
     turn = Rotation.from_euler("z", 10.0, degrees=True)

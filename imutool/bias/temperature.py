@@ -110,7 +110,7 @@ class TemperatureFilter:
         if self._z is None:
             self._z = np.tile(now, (1 + len(LOAD_TAU_S), 1))
         else:
-            keep = np.exp(-1e-9 * (t_ns - self._t_ns) / LOAD_TAU_S)[:, None]
+            keep = np.exp(-1e-9 * max(0, t_ns - self._t_ns) / LOAD_TAU_S)[:, None]  # a clock may be set back
             self._z[1:] = self._z[0] + keep * (self._z[1:] - self._z[0])
             self._z[0] = now
         self._t_ns = t_ns

@@ -16,6 +16,7 @@ from imutool.recording import Imu, Scalars
 from imutool.sensor.signals import TEMPERATURE_TERMS
 
 MOST_AGE_S = 60.0  # of a number of the channel: a case warms within minutes
+SET_BACK = 2  # half seconds: further back the clock was set, and the sample is not late
 MOST_BEYOND_K = 1.0  # beyond the trained range, before it counts as another one
 Rows3 = Float64[np.ndarray, "n 3"]
 Rows6 = Float64[np.ndarray, "n 6"]
@@ -73,12 +74,14 @@ class OnlineDrift:
         self._K = {
             sensor: theta.reshape(3, TEMPERATURE_TERMS).T for sensor, (theta, _) in model.temperature_parameters().items()
         }
-        self._half_second, self._bias = -1, np.zeros(6)
+        self._half_second, self._bias = -(2**63), np.zeros(6)
 
     def __call__(self, t_ns: int, temperature: float | None) -> Vector6:
         """Drift from a sample on; its temperature is in °C or kelvin, None if it has none."""
-        if temperature is not None and math.isfinite(temperature) and t_ns // EVERY_NS > self._half_second:
-            self._half_second = t_ns // EVERY_NS
+        half_second = t_ns // EVERY_NS
+        is_new = half_second > self._half_second or half_second < self._half_second - SET_BACK
+        if temperature is not None and math.isfinite(temperature) and is_new:
+            self._half_second = half_second
             terms = self._follow(t_ns, celsius_of(temperature)) - self._mean
             for sensor, K in self._K.items():
                 self._bias[COLUMNS[sensor]] = terms @ K

@@ -19,7 +19,14 @@ from imutool.cleaning.truth import Truth, truth_of
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.errors import DataError
 from imutool.log_info.imu_motion import ImuMotion, blocks_of, motion_of
-from imutool.log_info.pose_imu_rotation import CORRECTION, body_warnings, motion_warnings, unlike, velocities_judged
+from imutool.log_info.pose_imu_rotation import (
+    CORRECTION,
+    body_warnings,
+    motion_warnings,
+    sparse_warnings,
+    unlike,
+    velocities_judged,
+)
 from imutool.log_info.report import Convention, TruthInfo
 from imutool.mcap_io.log import Log
 from imutool.recording import GRAVITY_M_S2, Imu, Recording
@@ -85,13 +92,15 @@ def _warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
 
 
 def _pose_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
-    """Warnings of poses that do not turn as the gyro does."""
-    turns = None if whole.truth is None else found.turns[whole.truth.topic].agreement()
-    if whole.truth is None or turns is None:
+    """Warnings of poses that do not turn as the gyro does, or are too far apart to show it."""
+    if whole.truth is None:
         return []
+    sparse, turns = sparse_warnings(whole.truth), found.turns[whole.truth.topic].agreement()
+    if turns is None:
+        return sparse
     topic, turned_deg = whole.truth.topic, [] if turns.turned is None else turns.turned.deg.tolist()
     seen = turns.explained, turns.rms_rad_s, turns.jumps, turns.largest_jump_deg
-    return [*body_warnings(topic, turned_deg), *motion_warnings(topic, *seen)]
+    return [*body_warnings(topic, turned_deg), *motion_warnings(topic, *seen), *sparse]
 
 
 def lean_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:

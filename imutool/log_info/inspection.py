@@ -31,7 +31,7 @@ from imutool.log_info.convention_report import (
 from imutool.log_info.imu_motion import ImuMotion
 from imutool.log_info.imu_samples import ImuSamples
 from imutool.log_info.pose_coverage import coverage, transforms
-from imutool.log_info.pose_imu_rotation import Agreement
+from imutool.log_info.pose_imu_rotation import Agreement, sparse_warnings
 from imutool.log_info.report import ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.reflection import LOG_TIME, Reflected
@@ -85,6 +85,7 @@ def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
     warnings = [f"{imu.topic}: {warning}" for imu in imus for warning in imu.warnings]
     vectors = log.with_schema((schemas.VECTOR3,))
     warnings += [*(truth_warnings(truths) if own else [f"no IMU topic{JOIN_VECTORS if len(vectors) > 1 else ''}"]), *refused]
+    warnings += [] if own is None or true_poses is None else sparse_warnings(true_poses)
     warnings += made_by_convert(log, has_imu=own is not None, has_poses=bool(truths))
     first = min((topic.first_ns for topic in topics if topic.first_ns is not None), default=None)
     last = max((topic.last_ns for topic in topics if topic.last_ns is not None), default=None)

@@ -17,7 +17,7 @@ from imutool.log_info.imu_samples import ImuSamples
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.recording import GAP_FACTOR, Imu, Recording, seconds
-from imutool.recording.columns import median
+from imutool.recording.columns import median, quantile
 
 logger = logging.getLogger(__name__)
 
@@ -29,6 +29,8 @@ JUMP_DEG, JUMP_MEDIANS, JUMP_SHARE = 5.0, 10.0, 0.2  # misfit of a turn in 0.1 s
 LEAST_JUMPS_DEG = 15.0  # their sum, below which one is no news
 MOST_JUMPS, REFITS = 0.1, 4  # share of the turns up to which jumps are left out, and fits that find them
 UNSURE_SHARE, UNSURE_DEG = 0.1, (1.0, 3.0)  # of a rotation, within these: its standard deviation, if it is not reported
+SPARSE_S, FEWEST_BETWEEN = 0.15, 8  # period of poses, from which on they may be too far apart, and poses that show it
+MOST_BETWEEN_DEG, OFTEN = 1.0, 0.9  # error of turns between poses, and share of them that have less
 TURNED_DEG = 4.0  # more than a mount that was meant to be straight; EuRoC, TUM-VI and BROAD have up to 1.5
 CORRECTION = "imutool convert LOG OUT --fix corrects it"
 SAME_TURN = 1e-9  # of two quaternions, how far the product may be from 1
@@ -169,6 +171,27 @@ def motion_warnings(topic: str, explained: float, rms_rad_s: float, jumps: int, 
     often = "once" if jumps == 1 else f"{jumps} times"
     said = f"the poses {topic} turn by up to {largest_deg:.0f}° in 0.1 s that the gyro does not show, {often}"
     return [f"{said}: markers that were exchanged or hidden, a gyro at the end of its range, or clocks that differ"]
+
+
+def sparse_warnings(poses: Truth) -> list[str]:
+    """Warning of poses so far apart that interpolation misses the turns between them.
+
+    Where every other pose is left out, interpolation misses about four times as much as between all.
+    """
+    period_s = 1e-9 * float(median(np.diff(poses.t_ns)))
+    t_s = seconds(poses.t_ns, int(poses.t_ns[0]))
+    middle = np.flatnonzero(t_s[2:] - t_s[:-2] < GAP_FACTOR * period_s) + 1
+    if period_s < SPARSE_S or len(middle) < FEWEST_BETWEEN:
+        return []
+    q, share = quaternion.unit(poses.q_wb_wxyz), (t_s[middle] - t_s[middle - 1]) / (t_s[middle + 1] - t_s[middle - 1])
+    between = quaternion.slerp(q[middle - 1], q[middle + 1], share)
+    missed_deg = float(np.degrees(quantile(quaternion.angle_between(between, q[middle]), OFTEN))) / 4.0
+    if missed_deg < MOST_BETWEEN_DEG:
+        return []
+    what = (
+        f"the poses {poses.topic} are {period_s:.2g} s apart, and interpolation between them is off by up to {missed_deg:.1f}°"
+    )
+    return [f"{what}: starts, training and scores take this for an error of the samples"]
 
 
 class Body(NamedTuple):

@@ -37,7 +37,8 @@ def thinned(t_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, " n"], un
     """First finite number of each half second; a stamp that goes back is left out."""
     good = np.isfinite(values) & (t_ns > np.maximum.accumulate(np.concatenate([t_ns[:1] - 1, t_ns[:-1]])))
     t_ns, values = t_ns[good], values[good]
-    first = np.diff(t_ns // EVERY_NS, prepend=-1) > 0
+    half_second = t_ns // EVERY_NS
+    first = np.diff(half_second, prepend=half_second[:1] - 1) > 0
     return Scalars(t_ns[first], np.ascontiguousarray(values[first, None]), unit)
 
 

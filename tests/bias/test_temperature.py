@@ -25,12 +25,14 @@ from imutool.bias.networks import hybrid
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.temperature import temperature_scale, temperature_tensors
 from imutool.bias.temperature import FORMS, Scale, TemperatureFilter, channel_of
+from imutool.bias.temperature_drift import OnlineDrift
 from imutool.bias_start.correction import apply
 from imutool.bias_start.initial_bias import prior, tracked_from_prior
 from imutool.bias_start.model_choice import bound_to, find_initial_bias
 from imutool.bias_start.stretches import read_stretches
 from imutool.debiasing import debias
 from imutool.mcap_io.read import read
+from imutool.mcap_io.temperature import thinned
 from imutool.recording import Imu, Recording, Scalars
 from imutool.sensor.signals import LOAD_TAU_S, TEMPERATURE_TERMS
 from imutool.viewing.model.load_view import load as load_view
@@ -322,6 +324,22 @@ def test_a_live_stream_has_the_drift_of_the_log(model: BiasModel) -> None:
     rows = [online(t, *u, numbers.get(t)) for t, *u in zip(log.imu.t_ns.tolist(), log.imu.gyro, log.imu.accel, strict=True)]
     np.testing.assert_allclose([rate for rate, _, _ in rows], whole.imu.gyro, rtol=0, atol=1e-9)
     np.testing.assert_allclose([bias for _, _, bias in rows], whole.bias, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("first_s", "back_s"), [(-1000.0, 0.0), (1000.0, 500.0)])
+def test_a_live_stream_follows_the_temperature_on_any_clock(model: BiasModel, first_s: float, back_s: float) -> None:
+    """On one that starts below zero, and on one that is set back in the middle."""
+    drift, last = OnlineDrift(model), np.zeros(6)
+    for k in range(40):
+        t_ns = round(1e9 * (first_s + k - back_s * (k >= 20)))
+        last = drift(t_ns, CENTRE + HALF * (k / 39.0)).copy()
+    np.testing.assert_allclose(last, [SIZE, 0.0, 0.0, 0.0, 0.0, 0.0], atol=STORED)
+
+
+@pytest.mark.parametrize("first_ns", [0, -(10**10), START_NS])
+def test_of_each_half_second_the_first_number_is_kept_on_any_clock(first_ns: int) -> None:
+    t_ns = first_ns + 100_000_000 * np.arange(20)
+    np.testing.assert_array_equal(thinned(t_ns, np.arange(20.0), "degC").values[:, 0], [0.0, 5.0, 10.0, 15.0])
 
 
 def test_a_live_stream_without_temperature_is_told(model: BiasModel, caplog: pytest.LogCaptureFixture) -> None:

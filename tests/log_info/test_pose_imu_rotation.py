@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imutool.cleaning.truth import Truth
-from imutool.log_info.pose_imu_rotation import agreement, motion_warnings
-from imutool.recording import Imu
+from imutool.log_info.pose_imu_rotation import agreement, motion_warnings, sparse_warnings
+from imutool.recording import Imu, Poses
 
 RNG = np.random.default_rng(6)
 START_NS = 1_600_000_000_000_000_123
@@ -126,3 +126,29 @@ def test_a_few_large_jumps_hide_neither_the_motion_nor_the_mount() -> None:
     assert np.abs(found.turned.deg - MOUNT.as_rotvec(degrees=True)).max() < 5 * found.turned.std_deg.max()
     (warning,) = motion_warnings("/mocap", found.explained, found.rms_rad_s, found.jumps, found.largest_jump_deg)
     assert "turn by up to 150° in 0.1 s that the gyro does not show, 8 times" in warning
+
+
+@pytest.mark.parametrize(("every", "tempo", "warned"), [(1, 1.0, False), (10, 1.0, True), (10, 0.1, False)])
+def test_poses_too_far_apart_for_their_motion_are_named(every: int, tempo: float, warned: bool) -> None:
+    """Slow turns may be interpolated over a second, fast ones over a tenth of it."""
+    truth = poses(tempo)
+    t = np.arange(0.0, 29.0, 0.01)
+    kept = truth._replace(**{name: getattr(truth, name)[::every] for name in ("t_ns", "p_wb", "q_wb_wxyz")})
+    said = sparse_warnings(kept)
+    assert len(said) == warned
+    between, _ = Poses(*kept[1:4]).at(START_NS + np.rint(t * 1e9).astype(np.int64))
+    missed = Rotation.from_quat(between.q_wb_wxyz, scalar_first=True).inv() * attitude(t, tempo)
+    largest_deg = float(np.degrees(missed.magnitude()).max())
+    if warned:
+        stated_deg = float(said[0].split("up to ")[1].split("°")[0])
+        assert "/pose are 1 s apart" in said[0]
+        assert 0.5 * largest_deg < stated_deg < 1.5 * largest_deg
+    else:
+        assert largest_deg < 1.0
+
+
+def test_noise_jumps_and_gaps_of_poses_do_not_make_them_sparse() -> None:
+    t = np.concatenate([np.arange(0.0, 60.0, 1.0), np.arange(300.0, 360.0, 1.0)])
+    turn = 2.0 * (t > 30.0) + 0.01 * np.random.default_rng(0).normal(size=len(t))
+    q_wxyz = Rotation.from_rotvec(turn[:, None] * [0.0, 0.6, 0.8]).as_quat(scalar_first=True)
+    assert sparse_warnings(Truth("/pose", np.rint(t * 1e9).astype(np.int64), np.zeros((len(t), 3)), q_wxyz)) == []
