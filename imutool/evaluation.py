@@ -21,7 +21,7 @@ from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.model_choice import bound_to, check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
-from imutool.bias_start.stretches import measured_imu, read_stretches, without_vectors
+from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids, parse_aids
@@ -87,7 +87,7 @@ def evaluate(
         _refuse_twins(models)
     asked = None if aid is None else parse_aids(aid)
     results = list[dict[str, Any]]()
-    stretches = [without_vectors(stretch) for stretch in read_stretches(log, imu=imu, truth=truth)]
+    stretches = read_stretches(log, imu=imu, truth=truth)
     release_memory()
     in_log = [None] * len(stretches) if models else _debiased(log, stretches, truth)
     for stretch, debiased in zip(stretches, in_log, strict=True):
