@@ -193,9 +193,12 @@ class StretchClock:
         begins = np.flatnonzero((step > gap_ns) | (step < 0))
         self.stretches += [Stretch(int(stamp_ns[k]), float(step[k]) * 1e-9) for k in begins[:MOST_STRETCHES]]
         del self.stretches[MOST_STRETCHES:]
+        self.count, self._last_ns = self.count + len(step), int(stamp_ns[-1])
+        if not len(begins):  # as nearly always
+            return np.asarray(stamp_ns - self._removed_ns)
         kept = np.where((step > most_ns) | (step < 0), most_ns, step)
         removed = self._removed_ns + np.cumsum(step - kept)
-        self.count, self._last_ns, self._removed_ns = self.count + len(step), int(stamp_ns[-1]), int(removed[-1])
+        self._removed_ns = int(removed[-1])
         return np.asarray(stamp_ns - removed)
 
 

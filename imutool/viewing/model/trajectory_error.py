@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from imutool.array_types import Bool, Float64
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
-from imutool.inertial.metrics import align
+from imutool.inertial.scoring.alignment import align
 from imutool.inertial.strapdown import drift, window_drift
 from imutool.recording import Poses, Times, nanoseconds
 
@@ -120,7 +120,7 @@ def aligned(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignm
 
     `origin`: its first pose becomes the true one. `yaw`: positions are nearest by least squares among turns about the vertical,
     theta = atan2(sum (p x p_true)_z, sum (p . p_true)_xy) about the means, the four directions an inertial sensor cannot know.
-    `se3`: among all rigid motions (Umeyama 1991, `metrics.align`).
+    `se3`: among all rigid motions (Umeyama 1991, `alignment.align`).
 
     Raises:
         DataError: no row has truth, or positions that leave the motion of `se3` open.
