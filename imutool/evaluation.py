@@ -135,12 +135,12 @@ def _evaluated(
         fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong) if model and start else None
         release_memory()
         whole_log, std = _corrected(imu, model, start, with_std=aids is not None)
-        samples = whole_log.rows(span.rows)
+        samples = whole_log.rows(span.span)
         estimates: dict[str, PathBlocks] = {PURE: partial(integrated, samples, span)}
         if name == RAW and (gaps := gaps_crossed(span.t_ns, GAP_S, int(recording.imu.t_ns[0]))):
             logger.warning("%s: %s", recording.name, gaps)
         if aids is not None:
-            begin = StartPose.of(span.at(slice(0, 1)))
+            begin = StartPose.of(span.rows(slice(0, 1)))
             estimates[AIDED] = partial(in_memory, aided_path(samples, begin, residual_prior(start, std), aids), span)
         how = {"init": init if start else None, "init_how": start.how if start else None, "smooth": smooth}
         scores = list[dict[str, Any]]()
@@ -194,7 +194,7 @@ def _drift(
 def _without_delay(imu: Imu, span: TrueSpan, recording: Recording, drift_deg: float | None) -> Figures:
     """Delay of the poses against the debiased gyro, and the scores without it; None where it is not clear."""
     nothing, windows = Figures.fromkeys(DELAY), drift_windows(span.t_ns, span.valid, DELAY_WINDOW_S)
-    found = pose_delay(pieces(imu.rows(span.rows), span, windows, margin=1))
+    found = pose_delay(pieces(imu.rows(span.span), span, windows, margin=1))
     if found is None or drift_deg is None or abs(found[0]) < CLEAR_STDS * found[1]:
         return nothing
     moved = replace(recording.truth, t_ns=recording.truth.t_ns - nanoseconds(found[0]))
@@ -202,7 +202,7 @@ def _without_delay(imu: Imu, span: TrueSpan, recording: Recording, drift_deg: fl
         again = TrueSpan(imu.t_ns, moved, recording.name)
     except DataError:
         return nothing
-    samples = imu.rows(again.rows)
+    samples = imu.rows(again.span)
     left_deg = _drift(samples, again, None, None, samples)[DRIFTS[0]]
     if left_deg is None or not left_deg < MOST_DRIFT_LEFT * drift_deg:
         return nothing

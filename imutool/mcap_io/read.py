@@ -218,7 +218,7 @@ class _Columns:
             return np.zeros(0, np.int64), [np.zeros((0, width)) for width in widths]
         apart = [list(column) for column in zip(*parts, strict=True)]
         del parts  # so that no topic is in memory twice
-        stamp_ns, sequence, *columns = (_whole(apart.pop(0)) for _ in range(len(apart)))
+        stamp_ns, sequence, *columns = (joined_column(apart.pop(0)) for _ in range(len(apart)))
         for column in (stamp_ns, *columns) if self.run.alone else ():  # so that a recording needs no copy
             column.flags.writeable = False
         rows = self.run.rows if name == self.imu_topic else self.run.rows_of(stamp_ns)
@@ -286,8 +286,8 @@ class _Columns:
         return found
 
 
-def _whole(parts: list[np.ndarray]) -> np.ndarray:
-    """Parts of a column as one array; their memory goes back to the system."""
+def joined_column(parts: list[np.ndarray]) -> np.ndarray:
+    """Parts of a column as one array; the list is emptied, and its memory goes back to the system."""
     whole = np.concatenate(parts)
     parts.clear()
     if whole.nbytes > RELEASED_BYTES:

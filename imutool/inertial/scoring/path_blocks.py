@@ -18,6 +18,7 @@ from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Poses, Times
 
 AT_ONCE = 1 << 13  # samples, whose arrays stay in the cache
 Mask = Bool[np.ndarray, " n"]
+Windows = Int64[np.ndarray, "m 2"]  # first and last rows
 
 
 class PathBlock(NamedTuple):
@@ -50,13 +51,13 @@ class WindowPiece(NamedTuple):
 
     path: Poses
     truth: Poses
-    windows: Int64[np.ndarray, "m 2"]
+    windows: Windows
 
 
 class TrueSpan:
     """True poses at stamps, from the first stamp with truth to the last.
 
-    `rows` are those of the stamps, and `valid` marks the rows of them outside gaps of the truth, as in `Poses.at`.
+    `span` are the rows of the stamps, and `valid` marks those outside gaps of the truth, as in `Poses.at`.
 
     Raises:
         DataError: fewer than two stamps with truth.
@@ -67,10 +68,10 @@ class TrueSpan:
         valid = np.concatenate([np.zeros(0, bool), *(self._at(t_ns[rows])[1] for rows in _blocks(len(t_ns)))])
         if valid.sum() < 2:
             raise DataError("IMU and true poses share fewer than two samples", where=where, expected="an overlap")
-        self.rows = slice(int(np.argmax(valid)), len(valid) - int(np.argmax(valid[::-1])))
-        self.t_ns, self.valid = t_ns[self.rows], valid[self.rows]
+        self.span = slice(int(np.argmax(valid)), len(valid) - int(np.argmax(valid[::-1])))
+        self.t_ns, self.valid = t_ns[self.span], valid[self.span]
 
-    def at(self, rows: slice) -> Poses:
+    def rows(self, rows: slice) -> Poses:
         """True poses of some rows of the span."""
         return self._at(self.t_ns[rows])[0]
 
@@ -89,32 +90,44 @@ def integrated(imu: Imu, span: TrueSpan, *, means: bool = False) -> Iterator[Pat
     Raises:
         NumericsError: the numbers overflow.
     """
-    start = StartPose.of(span.at(slice(0, 1)))
+    start = StartPose.of(span.rows(slice(0, 1)))
     for rows in _blocks(len(imu)):
         samples = imu.rows(slice(rows.start, rows.stop + 1))  # the last starts the next block
         path = dead_reckon(trapezoidal(samples) if means else samples, start)
         start = StartPose.of(path, -1)
-        yield PathBlock(path.rows(slice(0, AT_ONCE)), span.at(rows), span.valid[rows])
+        yield PathBlock(path.rows(slice(0, AT_ONCE)), span.rows(rows), span.valid[rows])
 
 
 def in_memory(path: Poses, span: TrueSpan) -> Iterator[PathBlock]:
     """A path of the samples of a span, in blocks."""
     for rows in _blocks(len(path)):
-        yield PathBlock(path.rows(rows), span.at(rows), span.valid[rows])
+        yield PathBlock(path.rows(rows), span.rows(rows), span.valid[rows])
 
 
-def pieces(imu: Imu, span: TrueSpan, windows: Int64[np.ndarray, "m 2"], margin: int = 0) -> Iterator[WindowPiece]:
+def pieces(imu: Imu, span: TrueSpan, windows: Windows, margin: int = 0) -> Iterator[WindowPiece]:
     """Path and truth over some windows at a time, with a margin of rows at both ends.
 
     The rule is the trapezoidal one. Each path begins at the truth: over a window it is that from any other start, but for a
     constant turn.
     """
+    for rows, local in _groups(windows, margin):
+        true = span.rows(rows)
+        yield WindowPiece(dead_reckon(trapezoidal(imu.rows(rows)), StartPose.of(true)), true, local)
+
+
+def pieces_in_memory(path: Poses, truth: Poses, windows: Windows) -> Iterator[WindowPiece]:
+    """Path and truth over some windows at a time, of a path in memory."""
+    for rows, local in _groups(windows, 0):
+        yield WindowPiece(path.rows(rows), truth.rows(rows), local)
+
+
+def _groups(windows: Windows, margin: int) -> Iterator[tuple[slice, Windows]]:
+    """Rows of some windows at a time, and the windows in these rows."""
     first = 0
     for k in range(1, len(windows) + 1):
         if k == len(windows) or windows[k, 1] - windows[first, 0] > AT_ONCE:
-            rows = slice(max(0, int(windows[first, 0]) - margin), int(windows[k - 1, 1]) + 1 + margin)
-            true = span.at(rows)
-            yield WindowPiece(dead_reckon(trapezoidal(imu.rows(rows)), StartPose.of(true)), true, windows[first:k] - rows.start)
+            start = max(0, int(windows[first, 0]) - margin)
+            yield slice(start, int(windows[k - 1, 1]) + 1 + margin), windows[first:k] - start
             first = k
 
 

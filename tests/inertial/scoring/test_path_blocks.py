@@ -33,7 +33,7 @@ def test_blocks_have_the_errors_of_the_whole_path(made: Recording, means: bool) 
     path, true, valid = along_truth(imu, made.truth, made.name)
     span = TrueSpan(made.imu.t_ns, made.truth, made.name)
     np.testing.assert_array_equal(span.valid, valid)
-    samples = made.imu.rows(span.rows)
+    samples = made.imu.rows(span.span)
     whole = metrics.evaluate(path, true, valid)
     assert not valid.all()
     assert whole["rpe_m"]["20"] is not None
@@ -49,8 +49,8 @@ def test_blocks_have_the_errors_of_the_whole_path(made: Recording, means: bool) 
 
 def test_windows_drift_in_pieces_as_on_the_whole_path(made: Recording) -> None:
     span = TrueSpan(made.imu.t_ns, made.truth, made.name)
-    samples, windows = made.imu.rows(span.rows), drift_windows(span.t_ns, span.valid, 5.0)
-    true = span.at(slice(None))
+    samples, windows = made.imu.rows(span.span), drift_windows(span.t_ns, span.valid, 5.0)
+    true = span.rows(slice(None))
     expected = window_drift(dead_reckon(trapezoidal(samples), StartPose.of(true)), true, *windows.T)
     found = [
         (window_drift(piece.path, piece.truth, *piece.windows.T), piece) for piece in pieces(samples, span, windows, margin=1)
@@ -66,7 +66,7 @@ def test_windows_drift_in_pieces_as_on_the_whole_path(made: Recording) -> None:
 def test_relative_errors_keep_the_poses_of_the_longest_distance_alone(made: Recording) -> None:
     span = TrueSpan(made.imu.t_ns, made.truth, made.name)
     sums, kept = RelativeErrors((5.0, 20.0)), []
-    for block in integrated(made.imu.rows(span.rows), span):
+    for block in integrated(made.imu.rows(span.span), span):
         sums.add(*block.scored())
         kept.append(sums.kept)
     assert max(kept) < 1.5 * AT_ONCE
