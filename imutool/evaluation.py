@@ -5,42 +5,35 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from msgspec import to_builtins
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import GAP_S, BiasModel
 from imutool.bias.model_file import check_rate, find_model
 from imutool.bias_start.aided_path import aided_path, residual_prior
-from imutool.bias_start.bias_covariance import expected_drift
-from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std
+from imutool.bias_start.bias_covariance import ExpectedDrift
+from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std, corrected
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.model_choice import bound_to, check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
-from imutool.bias_start.stretches import measured_imu, read_stretches, without_vectors
+from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids, parse_aids
-from imutool.inertial.kinematics import trapezoidal
-from imutool.inertial.strapdown import (
-    StartPose,
-    along_truth,
-    dead_reckon,
-    drift_windows,
-    gaps_crossed,
-    stretch_with_truth,
-    window_drift,
-    with_velocity,
-)
+from imutool.inertial.scoring.path_blocks import PathBlocks, TrueSpan, in_memory, integrated, pieces
+from imutool.inertial.scoring.pose_delay import pose_delay
+from imutool.inertial.strapdown import StartPose, drift_windows, gaps_crossed, window_drift, with_velocity
 from imutool.log_info.aid_search import find_aids
 from imutool.log_info.convention_report import contradictions, warn_of_recordings
 from imutool.mcap_io.log import Log
 from imutool.processes.system import release_memory
-from imutool.recording import Imu, Poses, Recording, nanoseconds
+from imutool.recording import Imu, Recording, nanoseconds
 
 logger = logging.getLogger(__name__)
 
@@ -53,7 +46,6 @@ DELAY = "pose_delay_s", "pose_delay_std_s", "aoe_without_delay_deg", "drift_orie
 DEG = 180.0 / np.pi
 PURE, AIDED = "integration", "aided"
 Refused = Callable[[str, ImutoolError], None]
-Mask = Bool[np.ndarray, " n"]
 Figures = dict[str, float | None]
 
 
@@ -87,7 +79,7 @@ def evaluate(
         _refuse_twins(models)
     asked = None if aid is None else parse_aids(aid)
     results = list[dict[str, Any]]()
-    stretches = [without_vectors(stretch) for stretch in read_stretches(log, imu=imu, truth=truth)]
+    stretches = read_stretches(log, imu=imu, truth=truth)
     release_memory()
     in_log = [None] * len(stretches) if models else _debiased(log, stretches, truth)
     for stretch, debiased in zip(stretches, in_log, strict=True):
@@ -136,18 +128,20 @@ def _evaluated(
     recorded = [(RAW, recording.imu, None, None)]
     recorded += [] if debiased is None else [(str(about.get("model") or "debiased"), debiased, None, None)]
     found = started(recording, models, init, log, smooth=smooth, refused=refused)
+    span: TrueSpan | None = None
     for name, imu, model, start in [*recorded, *((name, recording.imu, model, start) for name, model, start in found)]:
-        rows, true, valid = stretch_with_truth(imu.t_ns, recording.truth, recording.name)
+        if span is None or imu is not recording.imu:
+            span = TrueSpan(imu.t_ns, recording.truth, recording.name)
         fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong) if model and start else None
-        debiasing, std = _corrected(imu, model, start, with_std=aids is not None)
-        corrected = debiasing.imu
-        del debiasing  # no array as long as the log stays when it is no longer needed
         release_memory()
-        estimates = {PURE: dead_reckon(corrected.rows(rows), StartPose.of(true))}
-        if name == RAW and (gaps := gaps_crossed(estimates[PURE], GAP_S, int(recording.imu.t_ns[0]))):
+        whole_log, std = _corrected(imu, model, start, with_std=aids is not None)
+        samples = whole_log.rows(span.span)
+        estimates: dict[str, PathBlocks] = {PURE: partial(integrated, samples, span)}
+        if name == RAW and (gaps := gaps_crossed(span.t_ns, GAP_S, int(recording.imu.t_ns[0]))):
             logger.warning("%s: %s", recording.name, gaps)
         if aids is not None:
-            estimates[AIDED] = aided_path(corrected.rows(rows), StartPose.of(true), residual_prior(start, std), aids)
+            begin = StartPose.of(span.rows(slice(0, 1)))
+            estimates[AIDED] = partial(in_memory, aided_path(samples, begin, residual_prior(start, std), aids), span)
         how = {"init": init if start else None, "init_how": start.how if start else None, "smooth": smooth}
         scores = list[dict[str, Any]]()
         for kind, estimate in estimates.items():
@@ -157,90 +151,82 @@ def _evaluated(
                 "estimate": kind,
                 "aids": aids.signals if aids and kind == AIDED else {},
             }
-            scores.append(of | how | {"fit": fit and to_builtins(fit)} | metrics.evaluate(estimate, true, valid))
+            scores.append(of | how | {"fit": fit and to_builtins(fit)} | metrics.evaluate_blocks(estimate))
             if trajectories is not None:
-                if (name, kind) == (RAW, PURE):
-                    metrics.write_trajectory(true.rows(valid), trajectories, recording.name, TRUTH, overwrite)
                 label = name if kind == PURE else f"{name}_{kind}"
-                metrics.write_trajectory(estimate.rows(valid), trajectories, recording.name, label, overwrite)
+                for side, named in enumerate((label, TRUTH) if (name, kind) == (RAW, PURE) else (label,)):
+                    parts = (block.scored()[side] for block in estimate())
+                    metrics.write_trajectory(parts, trajectories, recording.name, named, overwrite)
         del estimates, estimate
-        corrected = trapezoidal(corrected)  # now means of each sample and the next
-        drifted, delay = _drifts(corrected, (rows, true, valid), recording, model, start)
-        del true, valid
-        drifted |= _without_delay(delay, corrected, recording, drifted[DRIFTS[0]])
+        drifted = _drift(samples, span, model, start, recording.imu, has_positions=scores[0]["ape_m"] is not None)
+        drifted |= _without_delay(whole_log, span, recording, drifted[DRIFTS[0]]) if model else Figures.fromkeys(DELAY)
         bias = np.zeros(6) if start is None else start.rest
         results += [score | drifted | {"gyro_bias": bias[:3].tolist(), "accel_bias": bias[3:].tolist()} for score in scores]
-        del corrected
+        del whole_log, samples  # the next ones need the memory
     return results
 
 
-def _drifts(
-    means: Imu,
-    truth: tuple[slice, Poses, Mask],
-    recording: Recording,
-    model: BiasModel | None,
-    start: InitialBias | None,
-) -> tuple[Figures, tuple[float, float] | None]:
-    """Drift of windows that start from the truth, what the bias covariance expects, and a delay of the poses.
-
-    `means` are those of each sample and the next (`kinematics.trapezoidal`).
-    """
-    rows, true, valid = truth
-    path = dead_reckon(means.rows(rows), StartPose.of(true))
-    drifted = _drift(path, true, valid, model, start, recording.imu)
-    return drifted, metrics.pose_delay(path, true, drift_windows(path, valid, DELAY_WINDOW_S)) if model else None
-
-
-def _drift(path: Poses, true: Poses, valid: Mask, model: BiasModel | None, start: InitialBias | None, imu: Imu) -> Figures:
+def _drift(
+    samples: Imu, span: TrueSpan, model: BiasModel | None, start: InitialBias | None, imu: Imu, *, has_positions: bool = True
+) -> Figures:
     """Root mean squares of the drift of windows that start from the truth, and of what the bias covariance expects.
 
-    None if no window fits.
+    `samples` are those of `imu` in the span, corrected. None if no window fits.
     """
-    windows = drift_windows(path, valid, DRIFT_S)
-    found = window_drift(path, true, *windows.T)
-    squares = {"drift_orientation_deg": found.orientation_rad**2, "drift_velocity_m_s": found.velocity_m_s**2}
-    if model is not None and start is not None:
-        variances = expected_drift(model, start, imu, path, windows).diagonal(axis1=1, axis2=2)
-        squares["drift_orientation_std_deg"] = variances[:, :3].sum(axis=1)
-        squares["drift_velocity_std_m_s"] = variances[:, 3:].sum(axis=1)
-    out: Figures = {"drift_window_s": DRIFT_S}
-    for name in DRIFTS:
-        is_angle = name.endswith("deg")
-        known = name in squares and len(windows) > 0 and (is_angle or true.has_positions)
-        out[name] = float(np.sqrt(squares[name].mean())) * (DEG if is_angle else 1.0) if known else None
+    expected = None if model is None or start is None else ExpectedDrift(model, start, imu)
+    squares = list[Float64[np.ndarray, "_ m"]]()
+    for path, true, windows in pieces(samples, span, drift_windows(span.t_ns, span.valid, DRIFT_S)):
+        found = window_drift(path, true, *windows.T)
+        columns = [found.orientation_rad**2, found.velocity_m_s**2]
+        if expected is not None:
+            variances = expected(path, windows).diagonal(axis1=1, axis2=2)
+            columns += [variances[:, :3].sum(axis=1), variances[:, 3:].sum(axis=1)]
+        squares.append(np.array(columns))
+    out: Figures = {"drift_window_s": DRIFT_S, **dict.fromkeys(DRIFTS)}
+    if squares:
+        for name, column in zip(DRIFTS, np.concatenate(squares, axis=1), strict=False):  # without a model two
+            is_angle = name.endswith("deg")
+            if is_angle or has_positions:
+                out[name] = float(np.sqrt(column.mean())) * (DEG if is_angle else 1.0)
     return out
 
 
-def _without_delay(found: tuple[float, float] | None, imu: Imu, recording: Recording, drift_deg: float | None) -> Figures:
+def _without_delay(imu: Imu, span: TrueSpan, recording: Recording, drift_deg: float | None) -> Figures:
     """Delay of the poses against the debiased gyro, and the scores without it; None where it is not clear."""
-    nothing = Figures.fromkeys(DELAY)
+    nothing, windows = Figures.fromkeys(DELAY), drift_windows(span.t_ns, span.valid, DELAY_WINDOW_S)
+    found = pose_delay(pieces(imu.rows(span.span), span, windows, margin=1))
     if found is None or drift_deg is None or abs(found[0]) < CLEAR_STDS * found[1]:
         return nothing
     moved = replace(recording.truth, t_ns=recording.truth.t_ns - nanoseconds(found[0]))
     try:
-        path, true, valid = along_truth(imu, moved, recording.name)
+        again = TrueSpan(imu.t_ns, moved, recording.name)
     except DataError:
         return nothing
-    left_deg = _drift(path, true, valid, None, None, imu)[DRIFTS[0]]
+    samples = imu.rows(again.span)
+    left_deg = _drift(samples, again, None, None, samples)[DRIFTS[0]]
     if left_deg is None or not left_deg < MOST_DRIFT_LEFT * drift_deg:
         return nothing
-    return dict(zip(DELAY, (*found, metrics.absolute(path, true, valid)["aoe_deg"], left_deg), strict=True))
+    aoe_deg = metrics.absolute_blocks(partial(integrated, samples, again, means=True))["aoe_deg"]
+    return dict(zip(DELAY, (*found, aoe_deg, left_deg), strict=True))
 
 
 def _corrected(
     imu: Imu, model: BiasModel | None, start: InitialBias | None, *, with_std: bool = False
-) -> tuple[DebiasedImu, Float64[np.ndarray, "n 6"] | None]:
+) -> tuple[Imu, Float64[np.ndarray, "n 6"] | None]:
     """Samples corrected by a model, on request with the deviation of its bias; without one as they are."""
     if model is None or start is None:
-        return DebiasedImu(imu, np.zeros((len(imu), 6))), None
-    return apply_with_std(model, start, imu) if with_std else (apply(model, start, imu), None)
+        return imu, None
+    if not with_std:
+        return corrected(model, start, imu), None
+    debiased, std = apply_with_std(model, start, imu)
+    return debiased.imu, std
 
 
 def runs(
     recording: Recording, models: Sequence[str | Path], init: str, where: str | Path
 ) -> Iterator[tuple[str, DebiasedImu, InitialBias | None]]:
     """Samples as recorded, then corrected by each model: name, samples and bias, initial bias."""
-    yield RAW, _corrected(recording.imu, None, None)[0], None
+    yield RAW, DebiasedImu(recording.imu, np.zeros((len(recording.imu), 6))), None
     for name, model, start in started(recording, models, init, where):
         yield name, apply(model, start, recording.imu), start
 

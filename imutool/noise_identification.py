@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.bias_start.stretches import without_vectors
 from imutool.config import build
 from imutool.errors import DataError
 from imutool.file_location import Location
@@ -85,10 +84,10 @@ def identify(
     if not isinstance(log, Log):
         with Log(log) as opened:
             return identify(opened, imu=imu, truth=truth, model=model)
-    path, recording = log.path, longest_recording(read_recordings(log, imu=imu, truth=truth))
+    path, recording = log.path, longest_recording(read_recordings(log, imu=imu, truth=truth, vectors=False))
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
-    recording, remarks = in_si_units(without_vectors(recording))
+    recording, remarks = in_si_units(recording)
     release_memory()
     rest = _at_rest(recording.imu, remarks)
     motion = None

@@ -32,6 +32,7 @@ from imutool.inertial.preintegration import hat
 from imutool.recording import Imu, Poses, seconds
 from imutool.units import SENSORS, Sensor
 
+PASSED_AT_ONCE = 1 << 12  # samples between windows: roots take some hundred bytes each
 Roots = Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]
 
 
@@ -95,34 +96,43 @@ class _RunningMean:
         return out
 
 
-def expected_drift(
-    model: BiasModel, start: InitialBias, imu: Imu, path: Poses, windows: Int64[np.ndarray, "m 2"]
-) -> Float64[np.ndarray, "m 6 6"]:
-    """Drift covariance of windows of a path: attitude (rad), then velocity (m/s), by the bias.
+class ExpectedDrift:
+    """Drift covariance of windows by the bias, of pieces of a path that follow each other.
 
-    `imu` has the samples as recorded, and `path` is the integration of the debiased ones. Errors of a window's start do not
+    `imu` has the samples as recorded, and the paths are integrations of the debiased ones. Errors of a window's start do not
     count, nor does the noise of the samples: vibration is no white noise, and the noise at rest is much less than the bias.
     """
-    estimator, good = BiasEstimator(model, start), measured(imu.gyro, imu.accel)
-    imu = imu if good.all() else imu.rows(good)
-    t_ns, accel, samples = imu.t_ns, imu.accel, model_samples(model, imu)
-    out, done = np.zeros((len(windows), 6, 6)), 0
-    for k, (first_ns, last_ns) in enumerate(path.t_ns[windows]):
-        a, b = int(np.searchsorted(t_ns, first_ns)), int(np.searchsorted(t_ns, last_ns, side="right")) - 1
-        if b <= a:  # nothing was measured
-            continue
-        estimator.parts(*(column[done:a] for column in samples))
-        _, rest, roots = estimator.parts(*(column[a:b] for column in samples))
-        done = b
-        if model.log_drift is not None:
-            rest = rest + model.log_drift.covariance(t_ns[a:b])
-        rows = np.searchsorted(path.t_ns, t_ns[a : b + 1])
-        q_wb = path.q_wb_wxyz[rows]
-        force_w = quaternion.rotate(q_wb, accel[a : b + 1])
-        by_bias = drift_by_bias(seconds(t_ns[a : b + 1], int(first_ns)), q_wb, force_w)[:-1]
-        constant, moving = by_bias.sum(axis=0), np.einsum("nij,njp->ip", by_bias, stacked(roots, b - a))
-        out[k] = constant @ rest.mean(axis=0) @ constant.T + moving @ moving.T
-    return out
+
+    def __init__(self, model: BiasModel, start: InitialBias, imu: Imu) -> None:
+        good = measured(imu.gyro, imu.accel)
+        self._imu = imu if good.all() else imu.rows(good)
+        self._model, self._estimator, self._done = model, BiasEstimator(model, start), 0
+        self._samples = model_samples(model, imu)
+
+    def __call__(self, path: Poses, windows: Int64[np.ndarray, "m 2"]) -> Float64[np.ndarray, "m 6 6"]:
+        """Covariance of attitude (rad), then velocity (m/s), at the end of each window."""
+        t_ns, accel, log_drift = self._imu.t_ns, self._imu.accel, self._model.log_drift
+        out = np.zeros((len(windows), 6, 6))
+        for k, (first_ns, last_ns) in enumerate(path.t_ns[windows]):
+            a, b = int(np.searchsorted(t_ns, first_ns)), int(np.searchsorted(t_ns, last_ns, side="right")) - 1
+            if b <= a:  # nothing was measured
+                continue
+            for done in range(self._done, a, PASSED_AT_ONCE):
+                self._parts(done, min(done + PASSED_AT_ONCE, a))
+            _, rest, roots = self._parts(a, b)
+            self._done = b
+            if log_drift is not None:
+                rest = rest + log_drift.covariance(t_ns[a:b])
+            rows = np.searchsorted(path.t_ns, t_ns[a : b + 1])
+            q_wb = path.q_wb_wxyz[rows]
+            force_w = quaternion.rotate(q_wb, accel[a : b + 1])
+            by_bias = drift_by_bias(seconds(t_ns[a : b + 1], int(first_ns)), q_wb, force_w)[:-1]
+            constant, moving = by_bias.sum(axis=0), np.einsum("nij,njp->ip", by_bias, stacked(roots, b - a))
+            out[k] = constant @ rest.mean(axis=0) @ constant.T + moving @ moving.T
+        return out
+
+    def _parts(self, first: int, end: int) -> EstimateParts:
+        return self._estimator.parts(*(column[first:end] for column in self._samples))
 
 
 def drift_by_bias(

@@ -21,7 +21,7 @@ from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias, model_samples, tracked_from_prior
 from imutool.bias_start.stretches import LEAST_FORCE_M_S2, MOST, measured, unusual_gravity
 from imutool.errors import ConfigError, DataError
-from imutool.recording import LEAST_PERIOD_S, Imu, nanoseconds
+from imutool.recording import LEAST_PERIOD_S, Imu, Times, nanoseconds
 from imutool.recording.columns import MOST_GAP_S, median
 from imutool.units import FULL_SCALE_RAD_S
 
@@ -50,6 +50,19 @@ def apply(model: BiasModel, start: InitialBias, imu: Imu) -> DebiasedImu:
     return _debiased(imu, bias)
 
 
+def corrected(model: BiasModel, start: InitialBias, imu: Imu) -> Imu:
+    """Corrected samples as `apply`, whose bias takes as much memory again."""
+    samples, stream = model_samples(model, imu), start.stream(model)
+    if len(samples[0]) < len(imu):  # the bias of a sample that is no measurement is that of another
+        return apply(model, start, imu).imu
+    gyro, accel = imu.gyro.copy(), imu.accel.copy()
+    for rows in _blocks(len(imu)):
+        bias = _with_drift(model, imu.rows(rows), stream(*(column[rows] for column in samples)))
+        gyro[rows] -= bias[:, :3]
+        accel[rows] -= bias[:, 3:]
+    return _imu(imu.t_ns, gyro, accel)
+
+
 def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[DebiasedImu, Float64[np.ndarray, "n 6"]]:
     """Corrected samples as `apply`, and the standard deviation of the bias at each sample.
 
@@ -69,10 +82,14 @@ def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debi
 
 
 def _debiased(imu: Imu, bias: Float64[np.ndarray, "n 6"]) -> DebiasedImu:
-    gyro, accel = imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]
+    return DebiasedImu(_imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
+
+
+def _imu(t_ns: Times, gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]) -> Imu:
+    """Samples of columns that nobody else has."""
     for column in (gyro, accel):  # so that the samples need no copy
         column.flags.writeable = False
-    return DebiasedImu(Imu(imu.t_ns, gyro, accel), bias)
+    return Imu(t_ns, gyro, accel)
 
 
 def _blocks(count: int) -> Iterator[slice]:

@@ -145,25 +145,19 @@ def longest_stretch(recording: Recording) -> Recording:
 def read_stretches(path: Location, *, imu: str | None = None, truth: str | None = None) -> list[Recording]:
     """Recordings of a log, one for each stretch between jumps of its clock.
 
-    They are as `read` gives them, with all temperatures as scalars, and the names NAME_1, NAME_2 and so on.
+    They are as `read` gives them, with scalars of one column and all temperatures, and the names NAME_1, NAME_2 and so on.
 
     Raises:
         ConfigError, LogError: as `read`.
     """
     with Log(path) as log:
-        whole = with_temperatures(read_recordings(log, imu=imu, truth=truth), log)
+        whole = with_temperatures(read_recordings(log, imu=imu, truth=truth, vectors=False), log)
     parts = [part for one in whole for part in one.between_jumps()]
     found = [part for part in parts if len(part.imu) > 1 and (any(map(len, part.truths.values())) or not part.truths)]
     if len(found) < len(parts) > 1:
         logger.warning("%s: %d stretches of its clock hold no poses, and are left out", path, len(parts) - len(found))
     named = [replace(part, name=f"{part.name}_{n}") for n, part in enumerate(found, 1)]
     return named if len(parts) > 1 and named else parts[:1]
-
-
-def without_vectors(recording: Recording) -> Recording:
-    """The recording with the scalars alone that a temperature can be."""
-    numbers = {topic: scalars for topic, scalars in recording.scalars.items() if scalars.values.shape[1] == 1}
-    return replace(recording, scalars=numbers)
 
 
 class StretchClock:
@@ -199,9 +193,12 @@ class StretchClock:
         begins = np.flatnonzero((step > gap_ns) | (step < 0))
         self.stretches += [Stretch(int(stamp_ns[k]), float(step[k]) * 1e-9) for k in begins[:MOST_STRETCHES]]
         del self.stretches[MOST_STRETCHES:]
+        self.count, self._last_ns = self.count + len(step), int(stamp_ns[-1])
+        if not len(begins):  # as nearly always
+            return np.asarray(stamp_ns - self._removed_ns)
         kept = np.where((step > most_ns) | (step < 0), most_ns, step)
         removed = self._removed_ns + np.cumsum(step - kept)
-        self.count, self._last_ns, self._removed_ns = self.count + len(step), int(stamp_ns[-1]), int(removed[-1])
+        self._removed_ns = int(removed[-1])
         return np.asarray(stamp_ns - removed)
 
 

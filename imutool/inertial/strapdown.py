@@ -84,7 +84,7 @@ def dead_reckon(
     if not all(np.isfinite(column).all() for column in (q_wb, v_w, p_wb)):
         row = int(np.argmin(np.isfinite(np.concatenate([q_wb, v_w, p_wb], axis=1)).all(axis=1)))
         raise NumericsError(
-            f"integration overflows at sample {row}",
+            f"integration overflows at {imu.t_ns[row]} ns",
             expected="rates and forces of a moving body",
             fix="Check gyro and accel just before that sample",
         )
@@ -93,9 +93,9 @@ def dead_reckon(
     return Poses(imu.t_ns, p_wb, q_wb, v_w)
 
 
-def gaps_crossed(path: Poses, longer_s: float, start_ns: int) -> str:
+def gaps_crossed(t_ns: Times, longer_s: float, start_ns: int) -> str:
     """Gaps of the IMU that an integration crosses, in words; times count from `start_ns`."""
-    t = seconds(path.t_ns, start_ns)
+    t = seconds(t_ns, start_ns)
     gaps = np.flatnonzero(np.diff(t) > longer_s)
     if not len(gaps):
         return ""
@@ -188,14 +188,14 @@ def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: fl
     Raises:
         DataError: as `window_drift`.
     """
-    return window_drift(path, truth, *drift_windows(path, valid, window_s).T)
+    return window_drift(path, truth, *drift_windows(path.t_ns, valid, window_s).T)
 
 
-def drift_windows(path: Poses, valid: Bool[np.ndarray, " n"], window_s: float) -> Int64[np.ndarray, "m 2"]:
+def drift_windows(t_ns: Times, valid: Bool[np.ndarray, " n"], window_s: float) -> Int64[np.ndarray, "m 2"]:
     """First and last rows of consecutive windows, with truth at both ends and no gap within."""
-    t = seconds(path.t_ns, int(path.t_ns[0]))
+    t = seconds(t_ns, int(t_ns[0]))
     dt = np.diff(t)
-    gaps = np.concatenate([[0], np.cumsum(dt > GAP_FACTOR * np.median(dt))])
+    gaps = np.flatnonzero(dt > GAP_FACTOR * (median(dt) if len(dt) else 0.0))
     known = np.flatnonzero(valid)
     pairs = []
     first = 0
@@ -204,7 +204,7 @@ def drift_windows(path: Poses, valid: Bool[np.ndarray, " n"], window_s: float) -
         last = int(np.searchsorted(t, t[first] + window_s))
         if last >= len(t):
             break
-        if valid[last] and gaps[last] == gaps[first]:
+        if valid[last] and np.searchsorted(gaps, first) == np.searchsorted(gaps, last):
             pairs.append((first, last))
         first = last
     return np.array(pairs, np.int64).reshape(-1, 2)
@@ -224,15 +224,15 @@ def velocity_follows(poses: Poses) -> bool:
         return True
     t = seconds(poses.t_ns, int(poses.t_ns[0]))
     last = np.searchsorted(t, t + COMPARED_S)
-    first = np.flatnonzero(last < len(t))
-    dt = (t[last[first]] - t[first])[:, None]
-    steps = 0.5 * (poses.v_w[1:] + poses.v_w[:-1]) * np.diff(t)[:, None]
-    path = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    moved, stated = ((x[last[first]] - x[first]) / dt for x in (poses.p_wb, path))
-    if not len(moved):
-        return True
-    speed, off = (float(median(np.linalg.norm(x, axis=1))) for x in (moved, moved - stated))
-    return speed < LEAST_SPEED_M_S or off < MOST_OFF * speed
+    speed, off = np.empty((2, np.searchsorted(last, len(t))))
+    for start in range(0, len(speed), WINDOWS_AT_ONCE):
+        ends = last[start : min(start + WINDOWS_AT_ONCE, len(speed))] - start
+        n, rows = len(ends), slice(start, start + int(ends[-1]) + 1)
+        p, v, dt = poses.p_wb[rows], poses.v_w[rows], np.diff(t[rows])[:, None]
+        path = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (v[1:] + v[:-1]) * dt, axis=0)])
+        moved, stated = ((x[ends] - x[:n]) / (t[rows][ends] - t[rows][:n])[:, None] for x in (p, path))
+        speed[start : start + n], off[start : start + n] = quaternion.length(moved), quaternion.length(moved - stated)
+    return not len(speed) or bool(median(speed) < LEAST_SPEED_M_S or median(off) < MOST_OFF * median(speed))
 
 
 def truth_velocity(poses: Poses) -> Vectors:

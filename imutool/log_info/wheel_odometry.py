@@ -23,8 +23,8 @@ from imutool.cleaning.truth import of_poses
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.inertial.aids import WHEELS, Aids, Odometry
-from imutool.inertial.metrics import align
 from imutool.inertial.preintegration import hat
+from imutool.inertial.scoring.alignment import align
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
 from imutool.log_info.convention_report import convention_summary
 from imutool.log_info.pose_coverage import coverage

@@ -13,6 +13,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64, UInt32
 from imutool.errors import LogError
 from imutool.file_location import Location, log_name
+from imutool.geometry import quaternion
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.frames import read_frames
 from imutool.mcap_io.log import Log
@@ -27,12 +28,14 @@ from imutool.mcap_io.topics import (
     check_finite,
 )
 from imutool.mcap_io.write import own_and_user_metadata
+from imutool.processes.system import release_memory
 from imutool.recording import UNIT_QUATERNION_TOLERANCE, Imu, Poses, Recording, Scalars, unit_quaternions
 from imutool.recording.columns import ClockRun, clock_jumps, clock_runs, jump_warnings
 
 logger = logging.getLogger(__name__)
 
 DOUBTFUL = ("estimate", "odometry")  # kinds of poses
+RELEASED_BYTES = 1 << 20  # parts of a column this large leave memory that is worth its release
 
 
 def read(
@@ -73,6 +76,7 @@ def read_recordings(
     end_ns: int | None = None,
     samples: Imu | None = None,
     derived: bool = True,
+    vectors: bool = True,
     images: bool = True,
     refused: Callable[[str, LogError], None] | None = None,
     warn: Callable[..., None] = logger.warning,
@@ -80,8 +84,8 @@ def read_recordings(
     """Recordings of an open log, one for each stretch in which its clock is not set back.
 
     With `samples` those are the IMU's, and its messages are not read. With `refused`, poses that a recording cannot hold are
-    left out and `refused` is called with topic and error. Without `derived` the scalars that imutool computed are not read.
-    `warn` is called with what a warning says.
+    left out and `refused` is called with topic and error. Without `derived` the scalars that imutool computed are not read,
+    without `vectors` those of three columns. `warn` is called with what a warning says.
 
     Raises:
         LogError: as `read`.
@@ -91,7 +95,7 @@ def read_recordings(
     truths = _choose_truths(log, truth)
     velocities = {t.name: t.metadata[VELOCITY_KEY] for t in log.topics.values() if VELOCITY_KEY in t.metadata}
     numbers = [t for t in log.with_schema(SCALARS) if t.message_encoding in ENCODINGS and (derived or not t.is_derived)]
-    scalars = [t.name for t in numbers if t.name not in velocities]
+    scalars = [t.name for t in numbers if t.name not in velocities and (vectors or SCALARS[t.schema_name] == 1)]
     used = {name: of for name, of in velocities.items() if of in truths}
     others = {t: k for t in (*log.pose_topics, *truths) if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths}
     columns = _Columns(log, imu_topic, truths, used, scalars, refused, warn)
@@ -203,15 +207,18 @@ class _Columns:
         stamp_ns = np.concatenate([np.zeros(0, np.int64), *(part[0] for part in parts)])
         for warning in jump_warnings(clock_jumps(stamp_ns)) if samples is None else ():
             self.warn("%s %s: %s", self.log.path, self.imu_topic, warning)
-        for run in clock_runs(stamp_ns):
-            self.run = run
-            yield run
+        found = clock_runs(stamp_ns)
+        del parts, stamp_ns  # this function would keep them while recordings are made
+        for self.run in found:
+            yield self.run
 
     def columns(self, name: str, *widths: int) -> tuple[Int64[np.ndarray, " n"], list[Float64[np.ndarray, "n _"]]]:
         parts = self.kept.pop(name, []) if self.run.alone else self.kept.get(name, [])  # of one stretch nothing is asked twice
         if not parts:
             return np.zeros(0, np.int64), [np.zeros((0, width)) for width in widths]
-        stamp_ns, sequence, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+        apart = [list(column) for column in zip(*parts, strict=True)]
+        del parts  # so that no topic is in memory twice
+        stamp_ns, sequence, *columns = (joined_column(apart.pop(0)) for _ in range(len(apart)))
         for column in (stamp_ns, *columns) if self.run.alone else ():  # so that a recording needs no copy
             column.flags.writeable = False
         rows = self.run.rows if name == self.imu_topic else self.run.rows_of(stamp_ns)
@@ -250,12 +257,14 @@ class _Columns:
                 if not len(stamp_ns):
                     raise LogError(what, expected="poses of a tracked body")
                 self.warn("%s %s: %s and left out", self.log.path, name, what)
-            away = np.abs(np.linalg.norm(q_wb_wxyz, axis=1) - 1.0) > UNIT_QUATERNION_TOLERANCE
+            away = np.abs(quaternion.length(q_wb_wxyz) - 1.0) > UNIT_QUATERNION_TOLERANCE
             if away.any():  # rows that a recording takes as they are keep every bit
                 q_wb_wxyz = np.where(away[:, None], unit_quaternions(q_wb_wxyz), q_wb_wxyz)
             v_w = None
             for topic in (t for t, of in self.velocity_topics.items() if of == name and (t in self.kept or not len(stamp_ns))):
                 times, (v_w,) = self.columns(topic, 3)
+                if np.array_equal(stamp_ns, times):
+                    continue
                 _, both, rows = np.intersect1d(stamp_ns, times, assume_unique=True, return_indices=True)
                 if not len(both) and len(stamp_ns):
                     raise LogError(f"the velocities on {topic} have other stamps than the poses")
@@ -275,3 +284,12 @@ class _Columns:
                 continue
             found[name] = Scalars(stamp_ns, values, described.metadata.get(UNIT_KEY, ""))
         return found
+
+
+def joined_column(parts: list[np.ndarray]) -> np.ndarray:
+    """Parts of a column as one array; the list is emptied, and its memory goes back to the system."""
+    whole = np.concatenate(parts)
+    parts.clear()
+    if whole.nbytes > RELEASED_BYTES:
+        release_memory()
+    return whole

@@ -61,8 +61,7 @@ class Columns:
             if not np.isfinite(value).all():
                 row = int(np.argmin(np.isfinite(value).reshape(len(value), -1).all(axis=1)))
                 raise DataError(f"{kind}.{name} row {row} is {value[row].tolist()}", expected="finite numbers")
-        backward = np.flatnonzero(np.diff(self.t_ns) <= 0)
-        if len(backward):
+        if len(backward := np.flatnonzero(np.diff(self.t_ns) <= 0)):
             row = int(backward[0]) + 1
             raise DataError(
                 f"{kind} time goes from {self.t_ns[row - 1]} to {self.t_ns[row]} ns at row {row}",
@@ -244,8 +243,9 @@ def median(values: Shaped[np.ndarray, "..."], axis: int = 0) -> Any:
 
 def clock_jumps(t_ns: Int64[np.ndarray, " n"]) -> list[tuple[int, float]]:
     """Jumps of a clock: the first stamp behind each, and the step to it (s); stamps may go back."""
-    step = np.diff(t_ns)
-    stays_back = np.append(t_ns[2:], t_ns[-1:]) < t_ns[:-1] if len(t_ns) > 1 else step < 0
+    if len(t_ns) < 2 or ((step := np.diff(t_ns)).min() > -SET_BACK_NS and step.max() <= MOST_GAP_S * 1e9):
+        return []
+    stays_back = np.append(t_ns[2:], t_ns[-1:]) < t_ns[:-1]
     rows = np.flatnonzero((step > MOST_GAP_S * 1e9) | ((step <= -SET_BACK_NS) & stays_back))
     return [(int(t_ns[row + 1]), float(step[row]) * 1e-9) for row in rows]
 

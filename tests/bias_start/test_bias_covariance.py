@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imutool.bias import hybrid, static
-from imutool.bias_start.bias_covariance import BiasEstimator, expected_drift
+from imutool.bias_start.bias_covariance import BiasEstimator, ExpectedDrift
 from imutool.bias_start.bias_tracking import BiasTrajectory
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.prior_width import BiasPrior
@@ -115,7 +115,7 @@ def test_a_body_at_rest_is_expected_to_drift_as_a_constant_bias_makes_it(lost: s
     imu = Imu(np.arange(count) * 5_000_000, np.zeros((count, 3)), accel)
     still = Poses(imu.t_ns, np.zeros((count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)), np.zeros((count, 3)))
     windows = np.array([[0, 1000], [1000, 2000]])
-    found = expected_drift(static.Model(), WAYS["held"], imu, still, windows).diagonal(axis1=1, axis2=2)
+    found = ExpectedDrift(static.Model(), WAYS["held"], imu)(still, windows).diagonal(axis1=1, axis2=2)
     tilted = (9.81 * STD[:3] * length_s**2 / 2) ** 2 * [1.0, 1.0, 0.0]
     for variances in found:
         np.testing.assert_allclose(variances[:3], (STD[:3] * length_s) ** 2, rtol=0.02)

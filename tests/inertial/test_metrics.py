@@ -16,7 +16,9 @@ from support.evo import statistics
 from support.nees import consistency
 
 from imutool.errors import ConfigError, DataError, NumericsError
-from imutool.inertial.metrics import absolute, align, evaluate, pairs_by_distance, relative, write_tum
+from imutool.inertial.metrics import absolute, evaluate, relative, write_tum
+from imutool.inertial.scoring.alignment import align
+from imutool.inertial.scoring.relative_errors import pairs_by_distance
 from imutool.recording import Poses
 
 EVO_TOLERANCE = 1e-9  # measured 4e-16; the same formulas in double precision, summed in another order
@@ -75,8 +77,8 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Poses, Poses, np.nda
     valid = everything(truth)
     valid[700:900] = valid[2500:2510] = False  # drop-outs of the motion capture
     folder = tmp_path_factory.mktemp("evo")
-    write_tum(truth.rows(valid), folder / "ref.txt")
-    write_tum(estimate.rows(valid), folder / "est.txt")
+    write_tum([truth.rows(valid)], folder / "ref.txt")
+    write_tum([estimate.rows(valid)], folder / "est.txt")
     return estimate, truth, valid, folder
 
 
@@ -174,7 +176,7 @@ def test_pairs_found_by_bisection_are_those_of_a_search_of_all(seed: int, distan
         miss = np.abs(travelled[i + 1 :] - travelled[i] - distance_m)
         if miss.min() <= 0.1 * distance_m:
             expected.append((i, i + 1 + int(miss.argmin())))
-    i, j = pairs_by_distance(p, distance_m)
+    i, j = pairs_by_distance(travelled, np.arange(len(p) - 1), distance_m)
     assert list(zip(i.tolist(), j.tolist(), strict=True)) == expected
 
 
@@ -292,7 +294,7 @@ def test_covariances_that_cannot_be_are_refused() -> None:
 
 def test_tum_files_read_back_exactly(tmp_path: Path) -> None:
     poses = wander(50, seed=15)
-    write_tum(poses, tmp_path / "t.txt")
+    write_tum([poses], tmp_path / "t.txt")
     rows = [line.split() for line in (tmp_path / "t.txt").read_text().splitlines()]
     assert [int(row[0].replace(".", "")) for row in rows] == poses.t_ns.tolist()
     assert rows[0][0].partition(".")[2] == f"{poses.t_ns[0] % 10**9:09d}"
@@ -305,7 +307,7 @@ def test_tum_files_read_back_exactly(tmp_path: Path) -> None:
     ("t_ns", "text"), [(0, "0.000000000"), (-1, "-0.000000001"), (-1_500_000_000, "-1.500000000"), (7, "0.000000007")]
 )
 def test_stamps_keep_all_their_digits_on_either_side_of_zero(tmp_path: Path, t_ns: int, text: str) -> None:
-    write_tum(Poses(np.array([t_ns], np.int64), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])), tmp_path / "t.txt")
+    write_tum([Poses(np.array([t_ns], np.int64), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]))], tmp_path / "t.txt")
     assert (tmp_path / "t.txt").read_text().split()[0] == text
 
 
@@ -313,12 +315,12 @@ def test_an_existing_file_stays_unless_told_and_nothing_is_left_beside(tmp_path:
     poses, path = wander(3, seed=16), tmp_path / "t.txt"
     path.write_text("mine")
     with pytest.raises(ConfigError, match="overwrite"):
-        write_tum(poses, path)
+        write_tum([poses], path)
     assert path.read_text() == "mine"
-    write_tum(poses, path, overwrite=True)
+    write_tum([poses], path, overwrite=True)
     assert len(path.read_text().splitlines()) == 3
     with pytest.raises(ConfigError, match="cannot be written"):
-        write_tum(poses, tmp_path / "nowhere" / "t.txt")
+        write_tum([poses], tmp_path / "nowhere" / "t.txt")
     assert [p.name for p in tmp_path.iterdir()] == ["t.txt"]
 
 
@@ -328,5 +330,5 @@ def test_an_interrupt_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(os, "link", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        write_tum(wander(3, seed=17), tmp_path / "t.txt")
+        write_tum([wander(3, seed=17)], tmp_path / "t.txt")
     assert list(tmp_path.iterdir()) == []

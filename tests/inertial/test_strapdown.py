@@ -167,7 +167,7 @@ def test_paths_of_other_stamps_or_without_velocity_have_no_drift() -> None:
 
 def test_overflow_and_missing_samples_are_refused() -> None:
     t_ns = np.array([0, 10**12, 2 * 10**12], np.int64)
-    with pytest.raises(NumericsError, match="overflows at sample 1"):
+    with pytest.raises(NumericsError, match=r"overflows at 1000000000000 ns"):
         dead_reckon(Imu(t_ns, np.zeros((3, 3)), np.full((3, 3), 1e308)), LEVEL)
     with pytest.raises(DataError, match="no samples"):
         dead_reckon(Imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3))), LEVEL)

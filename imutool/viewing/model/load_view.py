@@ -221,7 +221,7 @@ def _scored(runs: Sequence[Run], truth: Poses, where: str, align: Alignment) -> 
         scored = list(pool.map(partial(_score, align=align), runs, known))
     traces, motions = tuple(trace for trace, _ in scored), [motion for _, motion in scored if motion]
     started = seconds(traces[0].path.t_ns[:1], int(runs[0].imu.t_ns[0]))[0]
-    gaps = gaps_crossed(traces[0].path, GAP_S, int(runs[0].imu.t_ns[0]))
+    gaps = gaps_crossed(traces[0].path.t_ns, GAP_S, int(runs[0].imu.t_ns[0]))
     how = "errors are without alignment" if align == "none" else f"paths and errors are shown after alignment {align}"
     return traces, [
         f"Paths start at the true pose, {started:.2f} s into the log; {how}.",
@@ -245,7 +245,8 @@ def _score(run: Run, known: TruthSpan, align: Alignment) -> tuple[Trace, str]:
     path = run.path_from(run.imu.rows(rows), StartPose.of(true))
     moved, motion = aligned(path, true, valid, align)
     figures = evaluate(path, true, valid)
-    trace = Trace(run, moved, errors(moved, true, valid), figures=figures, spectra=_spectra(run))
+    shown = replace(moved, v_w=None)  # no view draws its velocity
+    trace = Trace(run, shown, errors(moved, true, valid), figures=figures, spectra=_spectra(run))
     if not run.is_aided:  # only an integration goes on from a true pose as from its own
         trace = replace(trace, drift=drift_since_reset(path, true, valid), windows=windows(path, true, valid))
     if align == "none":

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from imutool.cleaning import Cleaner, CleaningSettings, Survey
+from imutool.cleaning import rows as rows_of
+from imutool.cleaning.samples import BLOCK
 from imutool.cleaning.survey import examine
 from imutool.cleaning.truth import truth_of
 from imutool.errors import DataError, LogError
@@ -16,7 +18,7 @@ from imutool.file_location import Location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch, TwistColumns
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.read import longest_recording, read_recordings
+from imutool.mcap_io.read import joined_column, longest_recording, read_recordings
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.temperature import with_temperatures
@@ -51,7 +53,7 @@ class _Read(NamedTuple):
 
     topic: str
     derived: list[str]
-    batches: dict[str, list[ImuBatch]]
+    messages: dict[str, ImuBatch]
     biases_by_topic: dict[str, list[TwistColumns]]
     rest: Recording
     metadata: list[tuple[str, dict[str, str]]]
@@ -78,10 +80,10 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
         notes.clear()
         opened = RecoveredLog
         contents = _read(opened(path), imu, truth, notes)
-    topic, derived, batches, biases_by_topic, rest, metadata = contents
+    topic, derived, messages, biases_by_topic, rest, metadata = contents
     where = f"{path} {topic}"
-    survey = examine(lambda: batches[topic], truth_of(rest), CleaningSettings(), where=str(path), topic=topic)
-    samples, logged, why = _sound_samples(batches[topic], survey, where)
+    survey = examine(lambda: _blocks(messages[topic]), truth_of(rest), CleaningSettings(), where=str(path), topic=topic)
+    samples, logged, why = _sound_samples(messages[topic], survey, where)
     if why:
         left = f"{survey.messages - survey.valid} of {survey.messages} messages are left out"
         notes.append(f"{topic} cannot be shown as it was recorded ({why}); as by debias --clean, {left}.")
@@ -91,13 +93,12 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
     model, start = _model_and_start(metadata, topic)
     debiased = []
     for name in derived:
-        run = _run(name, model, samples, batches[name], biases_by_topic)
+        run = _run(name, model, samples, messages[name], biases_by_topic)
         if run is None:
             notes.append(f"{name} is left out: its samples are not those of {topic}.")
         else:
             debiased.append(replace(run, start=start))
-    rows = longest_run(samples.t_ns)
-    shown = samples.rows(rows)
+    shown = samples.rows(longest_run(samples.t_ns))
     if len(shown) < len(samples):
         shares = f"{len(shown)} of {len(samples)} samples, from {shown.t_ns[0]} to {shown.t_ns[-1]} ns"
         notes.append(f"Only the longest stretch of {topic} on one setting of its clock is shown: {shares}.")
@@ -115,7 +116,7 @@ def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> 
         topic = log.only_imu() if shown is None else log.topic(shown, (schemas.IMU,)).name
         derived = [channel.name for channel in log.with_schema((schemas.IMU,)) if channel.metadata.get(DERIVED_KEY) == topic]
         biases = [channel.name for channel in log.with_schema((schemas.TWIST,)) if channel.metadata.get(DERIVED_KEY) == topic]
-        batches, biases_by_topic = _messages(log, [topic, *derived], biases)
+        messages, biases_by_topic = _messages(log, [topic, *derived], biases)
         found = read_recordings(
             log, imu=topic, truth=truth, samples=NO_SAMPLES, derived=False, refused=None if truth else refused
         )
@@ -126,12 +127,12 @@ def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> 
         metadata = log.metadata_records()
         if isinstance(log, RecoveredLog):
             notes += [f"The log is damaged; {line}." for line in describe(log.losses.plain())]
-    return _Read(topic, derived, batches, biases_by_topic, rest, metadata)
+    return _Read(topic, derived, messages, biases_by_topic, rest, metadata)
 
 
 def _messages(
     log: Log, imus: Sequence[str], biases: Sequence[str]
-) -> tuple[dict[str, list[ImuBatch]], dict[str, list[TwistColumns]]]:
+) -> tuple[dict[str, ImuBatch], dict[str, list[TwistColumns]]]:
     """Messages of some IMUs and biases, read in one pass."""
     samples: dict[str, list[ImuBatch]] = {name: [] for name in imus}
     biases_by_topic: dict[str, list[TwistColumns]] = {name: [] for name in biases}
@@ -141,10 +142,27 @@ def _messages(
                 samples[topic] += log.topics[topic].decode_imu(rows)
             else:
                 biases_by_topic[topic] += log.topics[topic].decode_twist(rows)
-    return samples, biases_by_topic
+    return {name: _whole(samples.pop(name)) for name in imus}, biases_by_topic
 
 
-def _sound_samples(batches: Sequence[ImuBatch], survey: Survey, where: str) -> tuple[Imu, LogTimes, str]:
+def _whole(batches: list[ImuBatch]) -> ImuBatch:
+    """Messages of an IMU as whole columns, which the samples share; the list is emptied."""
+    none, frame_id = np.zeros(0, np.int64), batches[0].frame_id if batches else ""
+    batches.append(ImuBatch(none, none, none.astype(np.uint32), none, np.zeros((0, 3)), np.zeros((0, 3)), ""))
+    apart = [list(column) for column in list(zip(*batches, strict=True))[:-1]]
+    batches.clear()
+    columns = [joined_column(apart.pop(0)) for _ in range(len(apart))]
+    for column in columns:  # so that the samples need no copy
+        column.flags.writeable = False
+    return ImuBatch._make([*columns, frame_id])
+
+
+def _blocks(messages: ImuBatch) -> Iterator[ImuBatch]:
+    for first in range(0, len(messages.stamp_ns), BLOCK):
+        yield rows_of(messages, slice(first, first + BLOCK))
+
+
+def _sound_samples(messages: ImuBatch, survey: Survey, where: str) -> tuple[Imu, LogTimes, str]:
     """Samples with the log times of their messages: as recorded, or cleaned with the reason.
 
     Raises:
@@ -152,25 +170,19 @@ def _sound_samples(batches: Sequence[ImuBatch], survey: Survey, where: str) -> t
     """
     why = ""
     try:
-        samples, logged = _columns(batches)
+        samples, logged = _columns(messages)
     except DataError as error:
         why = error.what
-        samples, logged = _columns(list(map(Cleaner(survey), batches)))
+        samples, logged = _columns(Cleaner(survey)(messages))
     if len(samples) < MIN_SAMPLES:
         what, unset = f"has {len(samples)} samples that can be shown", survey.messages >= MIN_SAMPLES and not survey.end_ns
         raise LogError(what, where=where, expected=f"at least {MIN_SAMPLES}", fix=UNSET_FIX if unset else "")
     return samples, logged, why
 
 
-def _columns(batches: Sequence[ImuBatch]) -> tuple[Imu, LogTimes]:
-    stamp_ns = np.concatenate([np.zeros(0, np.int64), *(batch.stamp_ns for batch in batches)])
-    log_ns = np.concatenate([np.zeros(0, np.int64), *(batch.log_time for batch in batches)])
-    gyro, accel = (
-        np.concatenate([np.zeros((0, 3)), *(getattr(batch, name) for batch in batches)]) for name in ("gyro", "accel")
-    )
-    for column in (stamp_ns, gyro, accel):  # so that the samples need no copy
-        column.flags.writeable = False
-    return Imu(stamp_ns, gyro, accel), LogTimes(stamp_ns, log_ns)
+def _columns(messages: ImuBatch) -> tuple[Imu, LogTimes]:
+    stamp_ns = messages.stamp_ns
+    return Imu(stamp_ns, messages.gyro, messages.accel), LogTimes(stamp_ns, messages.log_time)
 
 
 def _model_and_start(metadata: Sequence[tuple[str, Mapping[str, str]]], topic: str) -> tuple[str, str]:
@@ -181,11 +193,11 @@ def _model_and_start(metadata: Sequence[tuple[str, Mapping[str, str]]], topic: s
 
 
 def _run(
-    name: str, model: str, raw: Imu, batches: Sequence[ImuBatch], biases_by_topic: Mapping[str, Sequence[TwistColumns]]
+    name: str, model: str, raw: Imu, messages: ImuBatch, biases_by_topic: Mapping[str, Sequence[TwistColumns]]
 ) -> Run | None:
     """Debiased channel with bias and sigma from the log, else bias = raw - debiased per stamp."""
     try:
-        imu, _ = _columns(batches)
+        imu, _ = _columns(messages)
     except DataError:
         return None
     called = f"{IN_LOG}{model}" if model else name.rpartition("/")[2]

@@ -17,6 +17,7 @@ from imutool.array_types import Float64, Int64
 from imutool.bias_start.aided_path import aided_path
 from imutool.bias_start.prior_width import BiasPrior
 from imutool.errors import DataError
+from imutool.geometry import quaternion
 from imutool.inertial.aids import Aids
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Poses, Scalars, Times, nanoseconds, seconds
@@ -256,15 +257,17 @@ def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MAX_CURVE_ROWS) -
     buckets = max(1, (most - 2) // (2 * columns + 1))
     size = -(-n // buckets)
     starts = np.arange(0, n, size)
-    padded = np.full((columns, len(starts) * size), np.nan)  # by column: contiguous values are searched many times faster
-    padded[:, :n] = values.T
-    cut = padded.reshape(columns, len(starts), size)
-    hole = np.isnan(cut)
-    drawn = np.zeros(padded.shape[1], dtype=bool)
+    drawn, holes = np.zeros(len(starts) * size, dtype=bool), np.zeros((len(starts), size), dtype=bool)
     drawn[[0, n - 1]] = True
-    for least in (np.where(hole, np.inf, cut).argmin(axis=2), np.where(hole, -np.inf, cut).argmax(axis=2)):
-        drawn[starts + least] = True
-    holes = np.any(hole, axis=0)
+    for column in values.T:  # one after the other: contiguous values are searched many times faster
+        cut = np.full(len(starts) * size, np.nan)
+        cut[:n] = column
+        cut = cut.reshape(-1, size)
+        hole = np.isnan(cut)
+        for extreme, least in ((np.inf, np.argmin), (-np.inf, np.argmax)):
+            cut[hole] = extreme
+            drawn[starts + least(cut, axis=1)] = True
+        holes |= hole
     drawn[(starts + holes.argmax(axis=1))[np.any(holes, axis=1)]] = True
     rows: Rows = np.flatnonzero(drawn[:n])
     return rows
@@ -279,7 +282,9 @@ def path_rows(p_wb: Float64[np.ndarray, "n 3"], most: int = MAX_PATH_ROWS) -> Ro
     n = len(p_wb)
     if n <= most:
         return np.arange(n)
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p_wb, axis=0), axis=1))])
+    edges = range(0, n - 1, quaternion.ROWS_AT_ONCE)
+    steps = [quaternion.length(np.diff(p_wb[first : first + quaternion.ROWS_AT_ONCE + 1], axis=0)) for first in edges]
+    travelled = np.cumsum(np.concatenate([[0.0], *steps]))
     half = most // 2
     finite = np.isfinite(travelled[-1])  # squares of absurd positions overflow: then all rows are even in time
     along = np.searchsorted(travelled, np.linspace(0.0, travelled[-1], half)) if finite else np.zeros(0, np.int64)

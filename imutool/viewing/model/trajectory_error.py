@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from imutool.array_types import Bool, Float64
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
-from imutool.inertial.metrics import align
-from imutool.inertial.strapdown import drift, window_drift
+from imutool.inertial.scoring.alignment import align
+from imutool.inertial.scoring.path_blocks import pieces_in_memory
+from imutool.inertial.strapdown import drift_windows, window_drift
 from imutool.recording import Poses, Times, nanoseconds
 
 Alignment = Literal["none", "origin", "yaw", "se3"]
@@ -120,7 +121,7 @@ def aligned(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignm
 
     `origin`: its first pose becomes the true one. `yaw`: positions are nearest by least squares among turns about the vertical,
     theta = atan2(sum (p x p_true)_z, sum (p . p_true)_xy) about the means, the four directions an inertial sensor cannot know.
-    `se3`: among all rigid motions (Umeyama 1991, `metrics.align`).
+    `se3`: among all rigid motions (Umeyama 1991, `alignment.align`).
 
     Raises:
         DataError: no row has truth, or positions that leave the motion of `se3` open.
@@ -168,28 +169,32 @@ def drift_since_reset(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], 
     Where the truth is unknown, the reset waits until it is known again.
     """
     known = np.flatnonzero(valid)
-    turn_of = (path.t_ns[known] - path.t_ns[0]) // nanoseconds(reset_s)
-    resets = np.diff(turn_of, prepend=-1) > 0
-    last_reset = known[resets][np.cumsum(resets) - 1]
-    drifted = window_drift(path, truth, last_reset, slice(None) if valid.all() else known)
+    resets = known[np.diff((path.t_ns[known] - path.t_ns[0]) // nanoseconds(reset_s), prepend=-1) > 0]
     since_s, *errors = (np.full(len(path), np.nan) for _ in range(4))
-    since_s[known] = (path.t_ns[known] - path.t_ns[last_reset]) * 1e-9
-    for column, values in zip(errors, drifted._replace(orientation_rad=np.rad2deg(drifted.orientation_rad)), strict=True):
-        column[known] = values
+    spans = np.stack([resets, np.append(resets[1:] - 1, len(path) - 1)[: len(resets)]], axis=1)  # from each reset to the next
+    for piece in pieces_in_memory(path, truth, spans):
+        first = piece.windows[:, 0]
+        start = int(np.searchsorted(path.t_ns, piece.path.t_ns[0]))
+        rows = np.flatnonzero(valid[start : start + len(piece.path)])
+        last_reset = first[np.searchsorted(first, rows, side="right") - 1]
+        since_s[start + rows] = (piece.path.t_ns[rows] - piece.path.t_ns[last_reset]) * 1e-9
+        drifted = window_drift(piece.path, piece.truth, last_reset, rows)
+        for column, values in zip(errors, drifted._replace(orientation_rad=np.rad2deg(drifted.orientation_rad)), strict=True):
+            column[start + rows] = values
     if not truth.has_positions:
         errors[1:] = [np.full(len(path), np.nan)] * 2
     return Drift(reset_s, path.t_ns, since_s, *errors)
 
 
 def windows(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> tuple[Window, ...]:
-    """Drift over windows of each length in `WINDOWS_S` that fits (`strapdown.drift`)."""
-    rows = []
+    """Drift over windows of each length in `WINDOWS_S` that fits (`strapdown.drift_windows`)."""
+    rows, known = [], truth.has_positions
     for length_s in WINDOWS_S:
-        ends = drift(path, truth, valid, length_s)
-        if count := len(ends.position_m):
-            turned_deg, known = float(np.rad2deg(_rms(ends.orientation_rad))), truth.has_positions
-            moved = [_rms(values) if known else np.nan for values in (ends.velocity_m_s, ends.position_m)]
-            rows.append(Window(length_s, count, turned_deg, *moved))
+        of_length = drift_windows(path.t_ns, valid, length_s)
+        found = [window_drift(part, true, *local.T) for part, true, local in pieces_in_memory(path, truth, of_length)]
+        if found:
+            turned, *moved = (_rms(np.concatenate(column)) for column in zip(*found, strict=True))
+            rows.append(Window(length_s, len(of_length), float(np.rad2deg(turned)), *(moved if known else [np.nan] * 2)))
     return tuple(rows)
 
 

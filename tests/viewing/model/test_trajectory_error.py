@@ -145,8 +145,8 @@ def test_positions_on_a_line_leave_the_turn_open(stretch: Stretch) -> None:
 def test_errors_after_alignment_are_those_of_evo(stretch: Stretch, tmp_path: Path, alignment: Alignment, word: str) -> None:
     _, path, true, valid = stretch
     estimate = moved(path, Rotation.from_rotvec([0.3, -0.2, 0.9]), np.array([4.0, 5.0, 6.0]))  # origin has work to do
-    write_tum(true.rows(valid), tmp_path / "ref.txt")
-    write_tum(estimate.rows(valid), tmp_path / "est.txt")
+    write_tum([true.rows(valid)], tmp_path / "ref.txt")
+    write_tum([estimate.rows(valid)], tmp_path / "est.txt")
     rmse = statistics(tmp_path, [("ape", "ref.txt", "est.txt", word)])[0]["rmse"]
     got = errors(aligned(estimate, true, valid, alignment)[0], true, valid).position_total_m[valid]
     assert float(np.sqrt(np.mean(got**2))) == pytest.approx(rmse, rel=EVO_TOLERANCE)
