@@ -82,7 +82,7 @@ def _warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
         return []
     warnings, of_poses = [*found.constant_sensors(), *convention_warnings(whole)], _pose_warnings(found, whole)
     warnings += [warning for warning in of_poses if warnings and warning.endswith(BY_HAND)]
-    return warnings or of_poses or lean_warnings(found, whole)
+    return warnings or [*of_poses, *lean_warnings(found, whole)]
 
 
 def _pose_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
@@ -101,7 +101,8 @@ def lean_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
     It comes where no other warning names the cause. Turns about one axis, as of wheels, do not show how it lies; gravity does.
     """
     truth, vertical = whole.truth, whole.conventions.vertical_m_s2
-    if truth is None or vertical is None or vertical > LEAST_VERTICAL * GRAVITY_M_S2 or _pose_warnings(found, whole):
+    named = [warning for warning in _pose_warnings(found, whole) if not warning.endswith(BY_HAND)]
+    if truth is None or vertical is None or vertical > LEAST_VERTICAL * GRAVITY_M_S2 or named:
         return []
     causes = "the IMU lies otherwise than their body, their world is not z up, or gravity was subtracted"
     return [
@@ -201,9 +202,8 @@ def check_conventions(recordings: Iterable[Recording]) -> None:
     Raises:
         DataError: as `check_motion`.
     """
-    for recording in map(velocities_judged, recordings):
-        truth = truth_of(recording)
-        check_motion(motion_of(recording.imu, truth), truth, f"{recording.name} {recording.imu_topic}")
+    for each in map(velocities_judged, recordings):
+        check_motion(motion_of(each.imu, truth_of(each)), truth_of(each), f"{each.name} {each.imu_topic}")
 
 
 @np.errstate(over="ignore", invalid="ignore")

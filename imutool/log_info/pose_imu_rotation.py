@@ -150,13 +150,13 @@ def _agreement(
 
 
 def turned_somehow(explained: float, as_recorded: float) -> bool:
-    """Whether poses explain the gyro's motion with their body turned, and none of it as they are."""
+    """Whether poses explain the gyro's motion with their body turned, and none without."""
     less = 1.0 - explained < LESS_TURNED * (1.0 - as_recorded)
     return explained > LEAST_EXPLAINED and as_recorded < 0.0 and less
 
 
 def body_warnings(topic: str, turned_deg: Sequence[float], explained: float, as_recorded: float) -> list[str]:
-    """Warning of poses whose body is turned far against the gyro, whether or not the motion shows how."""
+    """Warning of poses whose body is turned far against the gyro, known how or not."""
     if not len(turned_deg) and turned_somehow(explained, as_recorded):
         said = f"the poses {topic} turn as the gyro does only with their body turned, and the motion does not show how"
         return [f"{said}: turns about one axis, as of a vehicle; {BY_HAND}"]
