@@ -231,6 +231,15 @@ def test_a_stated_unit_against_the_way_gravity_turns_is_doubted(tmp_path, named,
     assert any("gravity turns" in note and "is the unit right?" in note for note in notes) == doubted
 
 
+@pytest.mark.parametrize(("unit", "doubted"), [("ms", True), ("s", False), ("us", True)])
+def test_a_stated_unit_of_the_time_that_gives_no_rate_of_an_imu_is_doubted(tmp_path, unit, doubted):
+    """The header names another unit than the times have, which are of 100 Hz."""
+    size = {"ms": 1e6, "s": 1.0, "us": 1e-1}[unit]
+    names = [f"time [{unit}]", *(f"gyro_{a} [deg/s]" for a in "xyz"), *(f"acc_{a} [g]" for a in "xyz")]
+    path = write_csv(tmp_path / "imu.csv", names, [size * (T_S - T_S[0]), *COUNTS.T, *ACCEL_G.T])
+    assert any("is the unit of the time right?" in note for note in read(path).remarks.notes) == doubted
+
+
 @pytest.mark.parametrize("unit", [" [ft/s^2]", " (ft/s2)", " [feet/s²]", " [ft/s/s]", " (ft/sec/sec)", "_ft_s2"])
 def test_feet_are_read_where_they_are_stated_alone(tmp_path, unit):
     names = ["time_s", *(f"w{a}_dps" for a in "xyz"), *(f"acc_{a}{unit}" for a in "xyz")]
