@@ -57,10 +57,10 @@ class _Halves(NamedTuple):
 
 
 def perhaps(columns: Columns) -> list[str]:
-    """Lines of a map for more columns without a header, of which the first look like an IMU."""
+    """Lines of a map for columns of no names, of which the first look like an IMU."""
     groups: dict[str, list[str]] = {}
     for name in columns.values:
-        if match := re.fullmatch(r"(.*/)?(column \d{1,4}|time)", name):
+        if match := re.fullmatch(r"(.*/)?(column \d{1,4}|time)", name) or re.fullmatch(r"(.*)\[\d{1,4}\]", name):
             groups.setdefault(match[1] or "", []).append(name)
     for names in groups.values():  # a number of a frame, which does not rise in each row, is no time
         if (first := columns.values[names[0]]).dtype.kind in "iu" and not rises(first) and (np.diff(first) >= 0).all():

@@ -77,7 +77,7 @@ def _looked(path: Path, mtime_ns: int, size: int) -> Seen:  # the key notices a 
     entries = (known_layout(columns) or propose(columns)).entries
     is_imu, is_captured = entries.keys() >= {"gyro", "accel"}, is_mocap(start) or columns.is_mocap
     header = () if any(re.fullmatch(r"column \d+", name) for name in names) else names
-    return Seen(is_imu, bool(start and perhaps(columns)), has_poses(columns), is_captured, "time" in entries, header)
+    return Seen(is_imu, bool(perhaps(columns)), has_poses(columns), is_captured, "time" in entries, header)
 
 
 def span_ns(path: Path) -> tuple[int, int] | None:

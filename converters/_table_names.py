@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from functools import lru_cache
 
 XSENS_TIME = r"sample_?time_?fine"  # counts 100 us
@@ -35,6 +35,9 @@ UNITS = {
 }
 RATE_OR_FORCE_UNITS = (
     r"m?dps|(?:deg|rad)(?:_?(?:per_?)?s(?:ec(?:ond)?)?|ps)|mps2|ms2|mss|(?:m|ft)_(?:per_)?s_?2|mg|milli_?gs?"  # in a name
+)
+LENGTH_UNITS = (  # at the end of the name of a position or of a height
+    r"(?:[a-z]*[xyz]|[ned]|east|north|up|down|alt(?:itude)?|height|hgt|elevation)(?:_in)?_(mm|cm|m|met(?:er|re)s?)"
 )
 G_INSIDE = r"(?<=acc_)g|(?<=accel_)g|(?<=acceleration_)g"  # else `g` is a gyro
 WITHOUT_GRAVITY = r"(user|free|lin|linear)_?acc"  # where an acceleration with gravity is beside it
@@ -84,8 +87,17 @@ def triples(sensor: str, *names: dict[str, str]) -> dict[str, dict[str, str]]:
 
     `names` are spellings of the columns' names; `left_gyr_x` is of `left`, `gx2` of `imu2`.
     """
-    tries = (_triples(sensor, spelled, form) for form in (*FORMS, SYMBOLS[sensor]) for spelled in names)
-    return next(filter(None, tries), {})
+    tries = (_triples(sensor, spelled, form) for form in FORMS for spelled in names)
+    return next(filter(None, tries), {}) or _symbols(sensor, names[0])
+
+
+def _symbols(sensor: str, columns: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Columns of three axes with an aircraft's symbols in each group: `p`, `flight.p`, `imu/f_x`."""
+    leaves: dict[str, dict[str, str]] = {}
+    for column in columns:
+        leaves.setdefault(group_of(column), {})[column] = split_name(leaf_of(column))[0]
+    found = {group: _triples(sensor, names, SYMBOLS[sensor]) for group, names in leaves.items()}
+    return {split_name(group)[0] if group else name: each for group in found for name, each in found[group].items()}
 
 
 def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[str, str]]:
@@ -193,6 +205,9 @@ def split_name(column: str) -> tuple[str, str]:
     ):
         unit = next(u for u, p in UNITS.items() if re.fullmatch(p, end[1]))
         name = name[: end.start()]
+    elif not unit and (end := re.search(rf"(?:^|_){LENGTH_UNITS}$", name)):  # pos_x_m, alt_mm
+        unit = unit_named(end[1])
+        name = re.sub(r"(_in)?_[a-z]+$", "", name)
     elif not unit and (inside := re.search(rf"_({RATE_OR_FORCE_UNITS}|{G_INSIDE})(?=_[xyz012]$)", name)):  # acc_mg_x
         unit = next(u for u, p in UNITS.items() if re.fullmatch(p, inside[1]))
         name = name[: inside.start()] + name[inside.end() :]

@@ -239,7 +239,7 @@ class _GyroTurns(NamedTuple):
             return cls(np.zeros(0), np.zeros((0, 3)))
         t, rates = columns.values[names[0]].astype(float), columns.side_by_side(names[1:])
         known = np.isfinite(t)
-        t, rates = t[known] * TIME_NS[str(entries["time_unit"])] * 1e-9, np.nan_to_num(rates)[known]
+        t, rates = t[known] * TIME_NS[str(entries["time_unit"])] * 1e-9, np.where(np.isfinite(rates), rates, 0.0)[known]
         if len(t) and t[-1] - t[0] > MOST_S and (np.diff(t) >= 0.0).all():
             ends, power = np.searchsorted(t, t + MOST_S), np.cumsum((rates**2).sum(axis=1))
             start = int(np.argmax(power[ends - 1] - power))

@@ -33,6 +33,7 @@ GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gr
 # and above one of them in 70 tables of accelerometers on phones, boards and drones
 MOST_TENTH, MOST_MEAN = 0.6, 0.6
 MOST_OF_GRAVITY = 2.0  # factor between gravity and the median acceleration of a robot or a person that moves
+LEAST_HZ, MOST_HZ = 0.2, 50_000.0  # of samples; another unit of the time is a factor of 1000 away
 FULL_SCALE_RAD_S = 35.0  # 2000 degrees a second, the widest range of common gyros
 USUAL_SHARE = 0.99  # of the samples: single spikes show no unit
 COUNTS_A_G = {2: 16384, 4: 8192, 8: 4096, 16: 2048}  # by the range in g, of 16 bits
@@ -59,10 +60,12 @@ def is_motion_alone(columns: Columns, chosen: Sequence[str]) -> bool:
 
 
 def unit_doubts(imu: Imu, gyro_unit: str, accel_unit: str) -> list[str]:
-    """Doubts about units: by the size of gravity, the gyros' range, and the way gravity turns."""
+    """Doubts about units: by the rate, gravity's size, the gyros' range, and the way gravity turns."""
     if not len(imu):
         return []
-    doubts = []
+    doubts, rate_hz = [], 1e9 / float(np.median(np.diff(imu.t_ns))) if len(imu) > 1 else LEAST_HZ
+    if not LEAST_HZ <= rate_hz <= MOST_HZ:
+        doubts.append(f"it has {rate_hz:.3g} samples a second, which no IMU has: is the unit of the time right?")
     level = _usual(np.linalg.norm(imu.accel, axis=1), 0.5)
     if np.isfinite(level) and not 1.0 / MOST_OF_GRAVITY < level / GRAVITY_M_S2 < MOST_OF_GRAVITY:
         doubts.append(

@@ -20,6 +20,7 @@ from imutool.cleaning.unit_evidence import accel_reading
 from imutool.errors import DataError
 from imutool.log_info.imu_motion import ImuMotion, blocks_of, motion_of
 from imutool.log_info.pose_imu_rotation import (
+    BY_HAND,
     CORRECTION,
     body_warnings,
     motion_warnings,
@@ -87,8 +88,9 @@ def _warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
     """Warnings about units, axes and frames of samples that are used uncorrected."""
     if not found.motion.samples:
         return []
-    warnings = [*found.constant_sensors(), *convention_warnings(whole)]
-    return warnings or _pose_warnings(found, whole) or lean_warnings(found, whole)
+    warnings, of_poses = [*found.constant_sensors(), *convention_warnings(whole)], _pose_warnings(found, whole)
+    warnings += [warning for warning in of_poses if warnings and warning.endswith(BY_HAND)]
+    return warnings or [*of_poses, *lean_warnings(found, whole)]
 
 
 def _pose_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
@@ -100,7 +102,8 @@ def _pose_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
         return sparse
     topic, turned_deg = whole.truth.topic, [] if turns.turned is None else turns.turned.deg.tolist()
     seen = turns.explained, turns.rms_rad_s, turns.jumps, turns.largest_jump_deg
-    return [*body_warnings(topic, turned_deg), *motion_warnings(topic, *seen), *sparse]
+    body = body_warnings(topic, turned_deg, turns.explained, turns.as_recorded)
+    return [*body, *motion_warnings(topic, *seen), *sparse]
 
 
 def lean_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
@@ -109,7 +112,8 @@ def lean_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
     It comes where no other warning names the cause. Turns about one axis, as of wheels, do not show how it lies; gravity does.
     """
     truth, vertical = whole.truth, whole.conventions.vertical_m_s2
-    if truth is None or vertical is None or vertical > LEAST_VERTICAL * GRAVITY_M_S2 or _pose_warnings(found, whole):
+    named = [warning for warning in _pose_warnings(found, whole) if not warning.endswith(BY_HAND)]
+    if truth is None or vertical is None or vertical > LEAST_VERTICAL * GRAVITY_M_S2 or named:
         return []
     causes = "the IMU lies otherwise than their body, their world is not z up, or gravity was subtracted"
     return [
@@ -129,13 +133,13 @@ def check_start_poses(recording: Recording) -> float:
     motion = motion_of(recording.imu, truth)
     found, whole = None if truth is None else motion.turns[truth.topic].agreement(), motion.summary(truth)
     for warning in _warnings(motion, whole):
-        if warning.endswith(CORRECTION) or (found is not None and unlike(found.explained, found.rms_rad_s)):
+        what, fix = _apart(warning, truth)
+        if fix or (found is not None and unlike(found.explained, found.rms_rad_s)):
             raise DataError(
-                warning.removesuffix(f"; {CORRECTION}"),
+                what,
                 where=f"{recording.name} {recording.imu_topic}",
                 expected="poses and samples of one motion for a start from the truth",
-                fix=f"{_correction(warning, truth) if warning.endswith(CORRECTION) else 'See imutool info LOG'},"
-                " or give another `init`",
+                fix=f"{fix or 'See imutool info LOG'}, or give another `init`",
             )
     delay = whole.conventions.delay
     clear = delay is not None and delay.step is None and abs(delay.seconds) > max(START_LATE_S, LATE_STDS * delay.std_s)
@@ -175,6 +179,14 @@ def _correction(warning: str, truth: Truth | None) -> str:
     return CORRECTION.replace("--fix", f"--fix --kind {truth.topic}=truth")
 
 
+def _apart(warning: str, truth: Truth | None) -> tuple[str, str]:
+    """A warning without what to do, and that; empty where it says nothing to do."""
+    for fix, said in ((CORRECTION, _correction(warning, truth)), (BY_HAND, BY_HAND[0].upper() + BY_HAND[1:])):
+        if warning.endswith(fix):
+            return warning.removesuffix(f"; {fix}"), said
+    return warning, ""
+
+
 def check_one_sensor(recordings: Sequence[Recording]) -> None:
     """Refuse logs that state different sensors.
 
@@ -199,11 +211,10 @@ def check_conventions(recordings: Iterable[Recording]) -> None:
     """Refuse recordings whose units, axes or frames are wrong; log other warnings.
 
     Raises:
-        DataError: what `convert --fix` corrects.
+        DataError: as `check_motion`.
     """
-    for recording in map(velocities_judged, recordings):
-        truth = truth_of(recording)
-        check_motion(motion_of(recording.imu, truth), truth, f"{recording.name} {recording.imu_topic}")
+    for each in map(velocities_judged, recordings):
+        check_motion(motion_of(each.imu, truth_of(each)), truth_of(each), f"{each.name} {each.imu_topic}")
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -211,13 +222,15 @@ def check_motion(motion: ImuMotion, truth: Truth | None, where: str) -> None:
     """Check units, axes and frames of samples and poses that came in blocks.
 
     Raises:
-        DataError: what `convert --fix` corrects.
+        DataError: what `convert --fix` corrects, and a gyro that contradicts the true poses.
     """
-    for warning in _warnings(motion, motion.summary(truth)):
-        if warning.endswith(CORRECTION):
-            what = warning.removesuffix(f"; {CORRECTION}")
+    whole = motion.summary(truth)
+    wrong = contradictions(whole)
+    for warning in _warnings(motion, whole):
+        what, fix = _apart(warning, truth)
+        if fix or warning in wrong:
             expected = "units, axes and poses that agree"
-            raise DataError(what, where=where, expected=expected, fix=_correction(warning, truth))
+            raise DataError(what, where=where, expected=expected, fix=fix or BY_HAND[0].upper() + BY_HAND[1:])
         logger.warning("%s: %s", where, warning)
 
 
@@ -289,8 +302,10 @@ def truth_warnings(truths: Sequence[TruthInfo]) -> list[str]:
         return [f"no true poses: {others}; imutool evaluate LOG --truth TOPIC takes one of them" if others else "no true poses"]
     warnings = [f"{truth.topic}: shares no time with the IMU" for truth in usable if truth.coverage == 0.0]
     for truth in usable:
-        warnings += body_warnings(truth.topic, truth.body_turned_deg or [])
         explained, rms, jumps, largest = truth.gyro_explained, truth.gyro_rms_rad_s, truth.jumps, truth.largest_jump_deg
+        as_recorded = truth.gyro_explained_as_recorded
+        if isinstance(explained, float) and isinstance(as_recorded, float):
+            warnings += body_warnings(truth.topic, truth.body_turned_deg or [], explained, as_recorded)
         if isinstance(explained, float) and isinstance(rms, float) and isinstance(jumps, int) and isinstance(largest, float):
             warnings += motion_warnings(truth.topic, explained, rms, jumps, largest)
     return warnings

@@ -24,6 +24,7 @@ logger = logging.getLogger(__name__)
 LEAST_TURNS = 20  # between poses
 LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
 LEAST_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be reported
+LESS_TURNED = 1.0 / 3.0  # of what poses leave of the gyro's motion as they are, the part that a turned body leaves
 UNLIKE_RAD_S = 0.1  # rms that poses leave of the gyro's motion; EuRoC, TUM-VI and FETCH explain at least 91 %
 JUMP_DEG, JUMP_MEDIANS, JUMP_SHARE = 5.0, 10.0, 0.2  # misfit of a turn in 0.1 s; by the usual misfit; of the gyro's turn
 LEAST_JUMPS_DEG = 15.0  # their sum, below which one is no news
@@ -33,6 +34,7 @@ SPARSE_S, FEWEST_BETWEEN = 0.15, 8  # period of poses, from which on they may be
 MOST_BETWEEN_DEG, OFTEN = 1.0, 0.9  # error of turns between poses, and share of them that have less
 TURNED_DEG = 4.0  # more than a mount that was meant to be straight; EuRoC, TUM-VI and BROAD have up to 1.5
 CORRECTION = "imutool convert LOG OUT --fix corrects it"
+BY_HAND = "turn the axes of the IMU or those of the poses to one body, or record turns about two axes for --fix"
 SAME_TURN = 1e-9  # of two quaternions, how far the product may be from 1
 
 
@@ -41,6 +43,7 @@ class Agreement(NamedTuple):
 
     rms_rad_s: float
     explained: float
+    as_recorded: float  # share that they explain without that rotation; below zero, rates of the other sign
     turned: Turned | None  # None if the motion does not show it
     jumps: int  # steps of a tenth of a second in which the poses turn and the gyro does not
     largest_jump_deg: float
@@ -48,6 +51,7 @@ class Agreement(NamedTuple):
     def figures(self) -> dict[str, float]:
         """Entries of a report on the poses."""
         own = {"gyro_rms_rad_s": self.rms_rad_s, "gyro_explained": self.explained}
+        own |= {"gyro_explained_as_recorded": self.as_recorded}
         return own | {"jumps": self.jumps, "largest_jump_deg": self.largest_jump_deg}
 
 
@@ -139,18 +143,33 @@ def _agreement(
         return None
     rms = float(np.sqrt((misfit[kept] ** 2).mean()))
     explained = max(0.0, 1.0 - (rms / motion) ** 2)
+    as_recorded = 1.0 - float(((gyro - omega)[kept] ** 2).sum(axis=1).mean()) / motion**2
     seen = explained > LEAST_EXPLAINED
     body = rotation_deg(turn, gyro[kept], omega[kept], float(end[-1] - begin[0])) if seen else None
     if body is not None and body.std_deg.max() >= np.clip(UNSURE_SHARE * np.linalg.norm(body.deg), *UNSURE_DEG):
         body = None
-    return Agreement(rms, explained, body, len(jumps), float(jumps.max(initial=0.0)))
+    return Agreement(rms, explained, as_recorded, body, len(jumps), float(jumps.max(initial=0.0)))
 
 
-def body_warnings(topic: str, turned_deg: Sequence[float]) -> list[str]:
-    """Warning of poses whose body is turned far against the gyro."""
+def turned_somehow(explained: float, as_recorded: float) -> bool:
+    """Whether poses explain the gyro's motion with their body turned, and none without."""
+    less = 1.0 - explained < LESS_TURNED * (1.0 - as_recorded)
+    return explained > LEAST_EXPLAINED and as_recorded < 0.0 and less
+
+
+def body_warnings(topic: str, turned_deg: Sequence[float], explained: float, as_recorded: float) -> list[str]:
+    """Warning of poses whose body is turned far against the gyro, known how or not."""
+    if not len(turned_deg) and turned_somehow(explained, as_recorded):
+        said = f"the poses {topic} turn as the gyro does only with their body turned, and the motion does not show how"
+        return [f"{said}: turns about one axis, as of a vehicle; {BY_HAND}"]
     deg = float(np.linalg.norm(turned_deg))
-    what = f"the body of the poses {topic} is turned by {deg:.0f}° against the gyro; {CORRECTION}"
-    return [what] if deg > TURNED_DEG else []
+    return (
+        [f"the body of the poses {topic} is turned by {deg:.0f}° against the gyro; {CORRECTION}"] if _is_far(turned_deg) else []
+    )
+
+
+def _is_far(turned_deg: Sequence[float] | Float64[np.ndarray, " 3"]) -> bool:
+    return float(np.linalg.norm(turned_deg)) > TURNED_DEG
 
 
 def unlike(explained: float, rms_rad_s: float) -> bool:
@@ -204,7 +223,7 @@ class Body(NamedTuple):
 def turned_body(log: Log, imu: ImuSamples, topic: str) -> Body | None:
     """Body of poses that is turned by more than `TURNED_DEG`."""
     found = _turned_in(log, imu, topic)
-    if found is None or not body_warnings(topic, found.deg.tolist()):
+    if found is None or not _is_far(found.deg):
         return None
     return body_of(log, topic, quaternion.matrix(quaternion.exp(np.radians(found.deg)[None]))[0])
 
@@ -212,7 +231,7 @@ def turned_body(log: Log, imu: ImuSamples, topic: str) -> Body | None:
 def is_straight(log: Log, imu: ImuSamples, topic: str) -> bool:
     """Whether an IMU shows that it lies as the body of poses does."""
     found = _turned_in(log, imu, topic)
-    return found is not None and not body_warnings(topic, found.deg.tolist())
+    return found is not None and not _is_far(found.deg)
 
 
 def _turned_in(log: Log, imu: ImuSamples, topic: str) -> Turned | None:

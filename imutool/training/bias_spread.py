@@ -19,7 +19,7 @@ from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.networks.threads import of_each
 from imutool.bias_start.bias_at_rest import rest_differences
 from imutool.bias_start.bias_from_truth import LEAST_TRUTH_STD, TRUTH_S, bias_from_truth
-from imutool.bias_start.initial_bias import AT_REST_STD, SESSION_GAP_S
+from imutool.bias_start.initial_bias import AT_REST_STD, SESSION_GAP_S, UNKNOWN_BODY
 from imutool.bias_start.prior_width import USUAL_WALK
 from imutool.geometry import so3
 from imutool.inertial.stationary import white_noise
@@ -106,9 +106,11 @@ def store_statistics(
 def speed_of(pool: Pool) -> dict[str, Any]:
     """Speed of the training logs for the model card, if they move as vehicles do.
 
-    The filter takes velocity for noise of the density 2 v^2 tau, with its correlation time tau. The mean of such a velocity
-    over a longer time T has the variance 2 v^2 tau / T. The largest density over all T counts, of the mean of the logs.
+    The filter takes velocity for noise of the density 2 v^2 tau, with its correlation time tau, so its mean over a longer time
+    T has the variance 2 v^2 tau / T. The largest density over all T counts. Poses without positions show no speed.
     """
+    if "accel" not in pool.sensors:
+        return {"speed": UNKNOWN_BODY}
     densities = []
     for window_s in SPEED_WINDOWS_S:
         n = pool.samples(window_s)

@@ -32,7 +32,8 @@ HELD_OUT = 0.2  # the last fifth of every training log validates, as in the pape
 MAX_RATE_SPREAD = 0.05
 
 LEAST_S = 10.0  # of truth without gaps, in all logs together
-LEAST_TURN_RAD_S = 0.02  # of the rate about its own mean: less is a sensor on a table
+LEAST_TURN_RAD_S = 0.02  # of the rate about its own mean, over a second: less is a sensor on a table
+TURNING = 0.9  # share of the seconds in which a car on a straight road, or a robot that waits, may turn by less
 WINDOW_S = 1.0
 WORST_MISS = 0.2  # of a log's largest turns; EuRoC, TUM-VI, FETCH and BROAD miss by at most 3 %, inverse quaternions by 40 %
 
@@ -265,14 +266,13 @@ def check_trainable(recordings: Sequence[Recording], pool: Pool) -> None:
             expected=f"at least {LEAST_S:g} s, and minutes for a useful model",
             fix="Add logs, or look at their truth with imutool info",
         )
-    turning = float((pool.gyro - pool.gyro.mean(0)).norm(dim=1).median())
+    rates = pool.gyro[first[:, None] + torch.arange(n)].mean(1)  # noise is no motion
+    turning = float((rates - rates.mean(0)).norm(dim=1).quantile(TURNING))
     if turning < LEAST_TURN_RAD_S:
-        raise DataError(
-            f"the sensor stands still: half of the time it turns by less than {turning:.3f} rad/s",
-            where=", ".join(pool.names),
-            expected=f"motion, more than {LEAST_TURN_RAD_S:g} rad/s",
-            fix="Add logs in which it turns; for a sensor at rest, imutool debias needs no model",
-        )
+        what = f"the sensor stands still: {TURNING:.0%} of the time it turns by less than {turning:.3f} rad/s"
+        expected = f"motion, more than {LEAST_TURN_RAD_S:g} rad/s"
+        fix = "Add logs in which it turns; for a sensor at rest, imutool debias needs no model"
+        raise DataError(what, where=", ".join(pool.names), expected=expected, fix=fix)
     _truths_follow(pool, first, n)
 
 

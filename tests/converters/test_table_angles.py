@@ -63,6 +63,14 @@ def test_the_angles_that_a_sensor_gives_beside_its_rates_show_their_unit(tmp_pat
     assert log.poses == {}  # an orientation alone is the sensor's own
 
 
+def test_a_sample_that_is_infinite_hides_the_unit_of_no_other(tmp_path):
+    lines = sensor(np.rad2deg(RPY)).splitlines()
+    lines[1000] = lines[1000].rpartition(",")[0] + ", -Infinity"
+    (tmp_path / "dot.csv").write_text("\n".join(lines) + "\n")
+    gyro = read(tmp_path / "dot.csv").imus["/imu0"].gyro
+    np.testing.assert_allclose(gyro, np.delete(GYRO, 999, axis=0), atol=1e-5)
+
+
 @pytest.mark.parametrize("names", ["Euler_X,Euler_Y,Euler_Z", "des_roll,des_pitch,des_yaw"])
 def test_angles_of_another_motion_or_of_a_command_show_no_unit(tmp_path, names):
     header = SENSOR.replace("Euler_X,Euler_Y,Euler_Z", names)

@@ -508,3 +508,19 @@ def test_tables_of_a_folder_that_show_no_imu_are_named(tmp_path, caplog):
     assert [sequence.name for sequence in table.sequences(tmp_path)] == ["run", "walk"]
     (told,) = [line.getMessage() for line in caplog.records]
     assert told == f"{tmp_path}: tables that show no IMU are left out: other.csv"
+
+
+def test_a_folder_of_matrices_asks_for_a_map_and_takes_it(tmp_path):
+    """A script of a test bench saves all that it reads in one array, without names."""
+    angles = RNG.normal(0.0, 0.4, (COUNT, 3))
+    for name in ("slow", "fast"):
+        scipy.io.savemat(tmp_path / f"{name}.mat", {"data": np.column_stack([T_S, angles, ACCEL, GYRO, 0.0 * TURN])})
+    found = table.sequences(tmp_path)
+    assert [sequence.name for sequence in found] == ["fast", "slow"]
+    with pytest.raises(ConfigError, match="no columns look like the gyro"):
+        table.read_sequence(found[0])
+    named = {"time": "data[0]", "time_unit": "s", "gyro_unit": "rad/s", "accel_unit": "m/s^2"}
+    given = named | {sensor: [f"data[{first + axis}]" for axis in range(3)] for sensor, first in (("accel", 4), ("gyro", 7))}
+    imu = table.read_sequence(found[0], mapping=given).imus["/imu0"]
+    np.testing.assert_array_equal(imu.gyro, GYRO)
+    np.testing.assert_array_equal(imu.accel, ACCEL)

@@ -49,9 +49,12 @@ def recorded(folder: Path, unit: str, down: float, head: str = "latitude [{0}],l
     return table.read_sequence(sequence)
 
 
-@pytest.mark.parametrize("unit", ["deg", "rad"])
-def test_latitude_longitude_and_height_are_positions_of_true_angles(tmp_path, unit):
-    poses = recorded(tmp_path / "ship", unit, 1.0).poses["/ground_truth/pose"]
+STATED = "latitude [{0}],longitude [{0}],altitude [m]"
+
+
+@pytest.mark.parametrize(("unit", "head"), [("deg", STATED), ("rad", STATED), ("deg", "lat_{0},lon_{0},height_m")])
+def test_latitude_longitude_and_height_are_positions_of_true_angles(tmp_path, unit, head):
+    poses = recorded(tmp_path / "ship", unit, 1.0, head).poses["/ground_truth/pose"]
     latitude, longitude = LATITUDE + NED[:, 0] / 6.37e6, LONGITUDE + NED[:, 1] / (6.39e6 * np.cos(LATITUDE))
     place = ecef(latitude, longitude, HEIGHT_M - NED[:, 2])[EVERY]
     sin, cos = np.sin([LATITUDE, LONGITUDE]), np.cos([LATITUDE, LONGITUDE])

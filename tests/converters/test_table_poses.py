@@ -233,6 +233,19 @@ def test_rotations_and_positions_may_name_their_frames(tmp_path, rotation):
     np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO)
 
 
+@pytest.mark.parametrize(
+    ("names", "size"), [("x_{},y_{},z_{}", 1e3), ("pos_x_{},pos_y_{},pos_z_{}", 1.0), ("px_{},py_{},pz_{}", 1e2)]
+)
+def test_positions_state_their_unit_at_the_end_of_their_names(tmp_path, names, size):
+    unit = {1.0: "m", 1e2: "cm", 1e3: "mm"}[size]
+    (tmp_path / "imu.csv").write_text(imu_text())
+    header = f"t_s,{names.format(*[unit] * 3)},qx,qy,qz,qw\n"
+    (tmp_path / "groundtruth.csv").write_text(header + rows(T_S, size * P_M, XYZW))
+    (sequence,) = table.sequences(tmp_path)
+    poses = table.read_sequence(sequence).poses["/ground_truth/pose"]
+    np.testing.assert_allclose(poses.p_wb, P_M, atol=1e-6)
+
+
 def test_a_map_that_names_rotations_alone_takes_the_time_beside_them(tmp_path):
     names = [f"u{n}" for n in range(4)]
     (tmp_path / "gt.csv").write_text("time,x,y,z," + ",".join(names) + "\n" + rows(T_S[::2], P_M[::2], XYZW[::2]))

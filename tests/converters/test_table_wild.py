@@ -129,6 +129,7 @@ def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
         ([f"gyr_left_wrist_{a}_dps" for a in "xyz"], [f"acc_left_wrist_{a}" for a in "xyz"]),
         ([f"Gyro{a}_chest (deg/s)" for a in "XYZ"], [f"Accel{a}_chest" for a in "XYZ"]),
         (["p [deg/s]", "q [deg/s]", "r [deg/s]"], [f"accl{k}" for k in range(3)]),
+        ([f"flight.{a} [deg/s]" for a in "pqr"], [f"flight.f_{a}" for a in "xyz"]),  # of a structure, or of a folder's table
         ([f"gyro_deg_s[{k}]" for k in range(3)], [f"accelerometer_m_s2[{k}]" for k in range(3)]),
         ([f"Gyroscope {a} (deg/sec)" for a in "XYZ"], [f"Accelerometer {a} (m/s/s)" for a in "XYZ"]),
         ([f"gyro{a} (deg.s^-1)" for a in "XYZ"], [f"accel{a} (m.s^-2)" for a in "XYZ"]),  # SBG
@@ -228,6 +229,15 @@ def test_a_stated_unit_against_the_way_gravity_turns_is_doubted(tmp_path, named,
     values = gyro if written == "rad" else np.degrees(gyro)
     notes = read(write_csv(tmp_path / "imu.csv", names, [t_s, *values.T, *accel.T])).remarks.notes
     assert any("gravity turns" in note and "is the unit right?" in note for note in notes) == doubted
+
+
+@pytest.mark.parametrize(("unit", "doubted"), [("ms", True), ("s", False), ("us", True)])
+def test_a_stated_unit_of_the_time_that_gives_no_rate_of_an_imu_is_doubted(tmp_path, unit, doubted):
+    """The header names another unit than the times have, which are of 100 Hz."""
+    size = {"ms": 1e6, "s": 1.0, "us": 1e-1}[unit]
+    names = [f"time [{unit}]", *(f"gyro_{a} [deg/s]" for a in "xyz"), *(f"acc_{a} [g]" for a in "xyz")]
+    path = write_csv(tmp_path / "imu.csv", names, [size * (T_S - T_S[0]), *COUNTS.T, *ACCEL_G.T])
+    assert any("is the unit of the time right?" in note for note in read(path).remarks.notes) == doubted
 
 
 @pytest.mark.parametrize("unit", [" [ft/s^2]", " (ft/s2)", " [feet/s²]", " [ft/s/s]", " (ft/sec/sec)", "_ft_s2"])

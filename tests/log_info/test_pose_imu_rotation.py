@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imutool.cleaning.truth import Truth
-from imutool.log_info.pose_imu_rotation import agreement, motion_warnings, sparse_warnings
+from imutool.log_info.pose_imu_rotation import agreement, body_warnings, motion_warnings, sparse_warnings
 from imutool.recording import Imu, Poses
 
 RNG = np.random.default_rng(6)
@@ -152,3 +152,22 @@ def test_noise_jumps_and_gaps_of_poses_do_not_make_them_sparse() -> None:
     turn = 2.0 * (t > 30.0) + 0.01 * np.random.default_rng(0).normal(size=len(t))
     q_wxyz = Rotation.from_rotvec(turn[:, None] * [0.0, 0.6, 0.8]).as_quat(scalar_first=True)
     assert sparse_warnings(Truth("/pose", np.rint(t * 1e9).astype(np.int64), np.zeros((len(t), 3)), q_wxyz)) == []
+
+
+@pytest.mark.parametrize(("mount", "turned"), [((180.0, 0.0), True), ((180.0, 40.0), True), ((0.0, 0.0), False)])
+def test_a_vehicle_s_poses_in_another_body_are_named_though_the_motion_does_not_show_how(
+    mount: tuple[float, float], turned: bool
+) -> None:
+    """It turns about its vertical alone, and its poses are of a body whose z axis points down."""
+    t, t_imu = np.arange(0.0, 60.0, 0.1), np.arange(0.0, 60.0, 0.01)
+    body = Rotation.from_euler("XZ", mount, degrees=True)
+    gyro = np.stack([0.0 * t_imu, 0.0 * t_imu, 0.6 * np.cos(t_imu)], axis=1) + RNG.normal(0.0, NOISE_RAD_S, (len(t_imu), 3))
+    q_wxyz = (Rotation.from_rotvec(0.6 * np.sin(t)[:, None] * [0.0, 0.0, 1.0]) * body).as_quat(scalar_first=True)
+    truth = Truth("/ins", np.rint(t * 1e9).astype(np.int64), np.zeros((len(t), 3)), q_wxyz)
+    accel = np.tile([0.0, 0.0, 9.81], (len(t_imu), 1))
+    found = agreement(truth, Imu(np.rint(t_imu * 1e9).astype(np.int64), gyro, accel))
+    assert found is not None
+    assert found.explained > 0.99
+    assert found.turned is None
+    said = body_warnings("/ins", [], found.explained, found.as_recorded)
+    assert ["with their body turned, and the motion does not show how" in each for each in said] == [True] * turned

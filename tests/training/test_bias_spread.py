@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.switchings_on import Switchings, log
 
-from imutool.bias_start.initial_bias import AT_REST_STD
+from imutool.bias_start.initial_bias import AT_REST_STD, UNKNOWN_BODY
 from imutool.bias_start.prior_width import USUAL_WALK
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording
@@ -97,6 +97,8 @@ def test_logs_of_a_vehicle_widen_the_bound_on_speed() -> None:
         p_wb = speed / rate * np.stack([np.sin(rate * t_s), 1.0 - np.cos(rate * t_s), 0.0 * t_s], axis=1)
         speeds[speed] = speed_of(Pool.of([Recording("circle", imu, {"/pose": Poses(t_ns, p_wb, heading)})]))
     assert speeds[0.15] == {}
+    turned_alone = {"/pose": Poses(t_ns, np.zeros((len(t_s), 3)), heading)}
+    assert speed_of(Pool.of([Recording("circle", imu, turned_alone)]))["speed"] == UNKNOWN_BODY, "poses without positions"
     found = speeds[15.0]["speed"]
     np.testing.assert_allclose(found["speed_m_s"], 15.0 / np.sqrt(3.0), rtol=0.02)
     assert 1.0 < found["speed_correlation_s"] < 20.0

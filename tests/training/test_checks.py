@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from imutool.errors import DataError
 from imutool.mcap_io.read import read
-from imutool.recording import Imu, Recording
+from imutool.recording import Imu, Poses, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.training.training_windows import Pool, check_trainable
 
@@ -50,6 +51,22 @@ def test_a_sensor_on_a_table_is_refused(flown: Recording) -> None:
     still = np.full_like(flown.imu.gyro, 0.05) + 1e-3 * np.random.default_rng(0).normal(size=flown.imu.gyro.shape)
     with pytest.raises(DataError, match="stands still"):
         checked(with_gyro(flown, still))
+
+
+@pytest.mark.parametrize(("seldom", "accepted"), [(0.2, True), (0.02, False)])
+def test_a_sensor_that_seldom_turns_is_accepted(seldom: float, accepted: bool) -> None:
+    """A car on straight roads turns its heading for a share of the time."""
+    t_s, noise = np.arange(0.0, 100.0, 0.01), 5e-3 * np.random.default_rng(0).normal(size=(10_000, 3))
+    rate = np.where(t_s % 50.0 < 50.0 * seldom, 0.3, 0.0)
+    heading = np.cumsum(rate) * 0.01
+    t_ns, q_wxyz = (
+        np.round(1e9 * t_s).astype(np.int64),
+        np.stack([np.cos(heading / 2), 0 * t_s, 0 * t_s, np.sin(heading / 2)], 1),
+    )
+    imu = Imu(t_ns, np.outer(rate, [0.0, 0.0, 1.0]) + noise, np.tile([0.0, 0.0, 9.81], (len(t_s), 1)))
+    car = Recording("car", imu, {"/ground_truth/pose": Poses(t_ns, np.zeros((len(t_s), 3)), q_wxyz)})
+    with nullcontext() if accepted else pytest.raises(DataError, match="90% of the time"):
+        checked(car)
 
 
 def test_truths_of_other_flights_are_refused_by_their_names(flown: Recording) -> None:
