@@ -287,7 +287,10 @@ class _Columns:
 
 
 def joined_column(parts: list[np.ndarray]) -> np.ndarray:
-    """Parts of a column as one array; the list is emptied, and its memory goes back to the system."""
+    """Parts of a column as one array.
+
+    The list is emptied, and its memory goes back to the system.
+    """
     whole = np.concatenate(parts)
     parts.clear()
     if whole.nbytes > RELEASED_BYTES:

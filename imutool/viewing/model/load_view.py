@@ -245,8 +245,7 @@ def _score(run: Run, known: TruthSpan, align: Alignment) -> tuple[Trace, str]:
     path = run.path_from(run.imu.rows(rows), StartPose.of(true))
     moved, motion = aligned(path, true, valid, align)
     figures = evaluate(path, true, valid)
-    shown = replace(moved, v_w=None)  # no view draws its velocity
-    trace = Trace(run, shown, errors(moved, true, valid), figures=figures, spectra=_spectra(run))
+    trace = Trace(run, moved, errors(moved, true, valid), figures=figures, spectra=_spectra(run))
     if not run.is_aided:  # only an integration goes on from a true pose as from its own
         trace = replace(trace, drift=drift_since_reset(path, true, valid), windows=windows(path, true, valid))
     if align == "none":
