@@ -60,7 +60,7 @@ def is_motion_alone(columns: Columns, chosen: Sequence[str]) -> bool:
 
 
 def unit_doubts(imu: Imu, gyro_unit: str, accel_unit: str) -> list[str]:
-    """Doubts about units: by the rate, gravity's size, the gyros' range, and the way gravity turns."""
+    """Doubts about units: by the rate, gravity's size and turns, and the gyros' range."""
     if not len(imu):
         return []
     doubts, rate_hz = [], 1e9 / float(np.median(np.diff(imu.t_ns))) if len(imu) > 1 else LEAST_HZ
