@@ -29,17 +29,10 @@ from imutool.log_info.pose_imu_rotation import (
     velocities_judged,
 )
 from imutool.log_info.report import Convention, TruthInfo
-from imutool.mcap_io.log import Log
 from imutool.recording import GRAVITY_M_S2, Imu, Recording
 
 logger = logging.getLogger(__name__)
 
-CONVERTIBLE = {  # messages of which `convert` makes others
-    "nav_msgs/msg/Path": "poses",
-    "px4_msgs/msg/VehicleOdometry": "poses",
-    "px4_msgs/msg/VehicleImu": "an IMU",
-    "px4_msgs/msg/SensorGyro": "an IMU",
-}
 QUATERNIONS = "quaternions of poses"  # said only where they are misread
 START_LATE_S = 0.015  # half of what is a warning; a start from poses 10 ms late is off by about its standard deviation
 LEAST_VERTICAL = 0.85  # of gravity along the z of the poses, in the mean: 32 degrees
@@ -285,13 +278,6 @@ def _ratio(reading: Reading) -> str:
 
 def _unknown(whole: TopicSummary, why: str) -> tuple[bool, str]:
     return False, f"cannot be judged: {NO_POSES if whole.truth is None else why}"
-
-
-def made_by_convert(log: Log, *, has_imu: bool, has_poses: bool) -> list[str]:
-    """Hints at topics of which `convert` makes an IMU or poses, where the log has none."""
-    lacking = {"poses": not has_poses, "an IMU": not has_imu}
-    made = {topic.name: CONVERTIBLE.get(topic.own_schema or topic.schema_name, "") for topic in log.topics.values()}
-    return [f"imutool convert LOG OUT makes {what} of {name}" for name, what in made.items() if lacking.get(what)]
 
 
 def truth_warnings(truths: Sequence[TruthInfo]) -> list[str]:

@@ -20,14 +20,7 @@ from imutool.cleaning.truth import Truth, read_truth
 from imutool.file_location import Location, log_name
 from imutool.inertial.stationary import Batch, Blocks, block_statistics, resting_blocks
 from imutool.log_info.clock import in_blocks, stamps_in_order
-from imutool.log_info.convention_report import (
-    QUATERNIONS,
-    convention_warnings,
-    conventions,
-    lean_warnings,
-    made_by_convert,
-    truth_warnings,
-)
+from imutool.log_info.convention_report import QUATERNIONS, convention_warnings, conventions, lean_warnings, truth_warnings
 from imutool.log_info.imu_motion import ImuMotion
 from imutool.log_info.imu_samples import ImuSamples
 from imutool.log_info.pose_coverage import coverage, transforms
@@ -45,6 +38,12 @@ from imutool.report import UNSET
 CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: motors may idle in the others
 NOISE_WINDOW_S = 1.0
 JOIN_VECTORS = "; imutool debias and others read a gyro's and an accelerometer's vectors as one: --imu gyro=TOPIC,accel=TOPIC"
+CONVERTIBLE = {  # messages of which `convert` makes others
+    "nav_msgs/msg/Path": "poses",
+    "px4_msgs/msg/VehicleOdometry": "poses",
+    "px4_msgs/msg/VehicleImu": "an IMU",
+    "px4_msgs/msg/SensorGyro": "an IMU",
+}
 
 
 def inspect(path: Location, *, check: bool = True, max_chunk: int | None = None) -> LogInfo:
@@ -86,7 +85,7 @@ def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
     vectors = log.with_schema((schemas.VECTOR3,))
     warnings += [*(truth_warnings(truths) if own else [f"no IMU topic{JOIN_VECTORS if len(vectors) > 1 else ''}"]), *refused]
     warnings += [] if own is None or true_poses is None else sparse_warnings(true_poses)
-    warnings += made_by_convert(log, has_imu=own is not None, has_poses=bool(truths))
+    warnings += _made_by_convert(log, has_imu=own is not None, has_poses=bool(truths))
     first = min((topic.first_ns for topic in topics if topic.first_ns is not None), default=None)
     last = max((topic.last_ns for topic in topics if topic.last_ns is not None), default=None)
     return LogInfo(
@@ -106,6 +105,13 @@ def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
         checked=check,
         losses=log.losses.plain(),
     )
+
+
+def _made_by_convert(log: Log, *, has_imu: bool, has_poses: bool) -> list[str]:
+    """Hints at topics of which `convert` makes an IMU or poses, where the log has none."""
+    lacking = {"poses": not has_poses, "an IMU": not has_imu}
+    made = {topic.name: CONVERTIBLE.get(topic.own_schema or topic.schema_name, "") for topic in log.topics.values()}
+    return [f"imutool convert LOG OUT makes {what} of {name}" for name, what in made.items() if lacking.get(what)]
 
 
 def _topic(log: Log, topic: Topic) -> TopicInfo:
