@@ -121,8 +121,9 @@ def lines_of_choice(card: Mapping[str, Any]) -> list[str]:
     lines = [f"{sensor}: {', '.join(found['effects']) or 'no effect'}" for sensor, found in card.get("physics", {}).items()]
     compared = card.get("compared", {})
     if ode := compared.get("effects and neural_ode"):
-        kept = "kept" if card["held_out"] == ode else "dropped"
-        before = {sensor: found["error"] for sensor, found in compared["effects"].items()}
+        effects = compared["effects"]
+        kept = "kept" if card["held_out"] == ode != effects else "dropped"
+        before = {sensor: found["error"] for sensor, found in effects.items()}
         errors = (f"{sensor} {before[sensor]:.3g} to {found['error']:.3g} {found['unit']}" for sensor, found in ode.items())
         lines.append(f"neural ODE {kept}: held-out error of {', of '.join(errors)}")
     elif compared and len(card["logs"]) == 1:
