@@ -30,7 +30,7 @@ DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset;
     r"(?:(?P<year>\d{4})(?P<mark>[-/._])(?P<month>\d\d?)(?P=mark)(?P<day>\d\d?)"
     r"|(?P<first>\d\d?)(?P<sign>[./])(?P<second>\d\d?)(?P=sign)(?P<last>\d{4}))(?:[T ]+|_|--?)"
     r"(?P<clock>\d\d?(?P<colon>[:_.-])\d\d(?P=colon)\d\d)(?:(?:[.,]|(?P=colon))(?P<fraction>\d{1,9})\d*)?"
-    r" ?(?P<half>[AP]M)? ?(?P<zone>Z|UTC|[+-]\d\d:?\d\d)?",
+    r" ?(?P<half>[AP]M)? ?(?P<zone>Z|UTC|[+-]\d\d(:?\d\d)?)?",
     re.IGNORECASE,
 )
 CLOCK = re.compile(  # of one day or, as Excel shows times, of one hour; 15:04:05:123 ends with milliseconds
@@ -60,7 +60,7 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
         if half := match["half"]:
             seconds += HALF_DAY_S * ((half.upper() == "PM") - (match["clock"].startswith("12")))
         if (zone := match["zone"]) and zone[0] in "+-":
-            seconds -= int(f"{zone[0]}1") * (3600 * int(zone[1:3]) + 60 * int(zone[-2:]))
+            seconds -= int(f"{zone[0]}1") * (3600 * int(zone[1:3]) + 60 * int(zone[3:].strip(":") or 0))
         stamps.append(seconds * 10**9 + int((match["fraction"] or "0").ljust(9, "0")))
     if not 0 <= min(stamps) <= max(stamps) <= LAST_NS:
         return None

@@ -168,7 +168,7 @@ def _load_feather(path: Path, columns: Columns) -> None:
 
 def _numbers_of(schema: Any, columns: Columns) -> list[str]:
     """Names of the fields that hold numbers or times; the others are losses."""
-    numbers = [f.name for f in schema if re.match(r"u?int|float|double|halffloat|bool|timestamp|dict", str(f.type))]
+    numbers = [f.name for f in schema if re.match(r"u?int|float|double|halffloat|bool|timestamp|duration|dict", str(f.type))]
     words = [f.name for f in schema if re.match(r"large_string|string", str(f.type)) and tells_apart(f.name)]
     others = [field for field in schema if field.name not in (*numbers, *words)]
     columns.remarks.losses.extend(f"{field.name} is left out: it is of type {field.type}, no number" for field in others)
@@ -178,8 +178,8 @@ def _numbers_of(schema: Any, columns: Columns) -> list[str]:
 def _add_arrow(table: Any, columns: Columns) -> None:
     for name in table.column_names:
         column = table.column(name)
-        if str(column.type).startswith("timestamp"):
-            columns.add(f"{name} [ns]", column.cast("timestamp[ns]").cast("int64").to_numpy())
+        if times := re.match("timestamp|duration", str(column.type)):
+            columns.add(f"{name} [ns]", column.cast(f"{times[0]}[ns]").cast("int64").to_numpy())
         elif "string" in str(column.type):
             columns.add_labels(name, [str(text or "") for text in column.to_pylist()])
         else:

@@ -6,6 +6,7 @@ Each array of objects becomes a table; an object with an array of samples in it 
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter
 from collections.abc import Iterator
@@ -25,6 +26,8 @@ from ._table_text import Columns, read_csv
 
 START = re.compile(r'\s*(\{\s*"|\[\s*(\{\s*"|\[|-?\d+(\.\d+)?([eE][-+]?\d+)?\s*,))')
 NEXT = re.compile(rb"\}\s*\{")  # an object behind another, without a comma
+NOT_FINITE = re.compile(rb"[\[:,]\s*-?(NaN|Infinity)\b")
+NO_JSON = msgspec.DecodeError, ValueError, RecursionError
 LEAST_ROWS = 5  # objects of an array that is a table
 MOST_NUMBERS = 9  # or words, in an array that belongs to one sample, as a matrix does
 MOST_DAMAGED = 0.1  # share of the lines that a logger cut off or garbled
@@ -75,23 +78,37 @@ def load_json(path: Path, columns: Columns) -> None:
 def _decoded(path: Path, columns: Columns) -> Any:
     raw = read_bytes(path)
     try:
-        return msgspec.json.decode(raw)
-    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        return _value(raw)
+    except NO_JSON as error:
         lines = [line.strip().rstrip(b",") for line in raw.splitlines() if line.strip()]
         values = []
         for line in lines:
-            with suppress(msgspec.DecodeError, RecursionError, UnicodeDecodeError):
-                values.append(msgspec.json.decode(line))
+            with suppress(*NO_JSON):
+                values.append(_value(line))
         damaged = len(lines) - len(values)
-        with suppress(msgspec.DecodeError, RecursionError, UnicodeDecodeError):
+        with suppress(*NO_JSON):
             if damaged:
-                return msgspec.json.decode(b"[" + NEXT.sub(b"},{", raw) + b"]")
+                return _value(b"[" + NEXT.sub(b"},{", raw) + b"]")
         if len(values) < LEAST_ROWS or damaged > MOST_DAMAGED * len(lines):
             what = f"begins as JSON and cannot be read ({error})"
             raise DataError(what, where=path, expected="one JSON document, or one JSON value a line") from error
         if damaged:
             columns.remarks.losses.append(f"{damaged} of {len(lines)} lines are no JSON and are left out")
         return values
+
+
+def _value(raw: bytes) -> Any:
+    """JSON value of a text, in which Python may have written NaN and Infinity.
+
+    Raises:
+        One of NO_JSON: it is none.
+    """
+    try:
+        return msgspec.json.decode(raw)
+    except msgspec.DecodeError:
+        if not NOT_FINITE.search(raw):
+            raise
+        return json.loads(raw)
 
 
 def _nodes(node: Any, name: str) -> Iterator[tuple[str, Any]]:

@@ -68,6 +68,8 @@ class Columns:
     def add(self, name: str, array: Any, unit: str = "") -> None:
         """Take in an array of numbers of one, two or three dimensions."""
         array = np.asarray(array)
+        if array.dtype.kind in "Mm":  # dates and times of NumPy, whatever their unit
+            array, unit = array.astype(f"{array.dtype.kind}8[ns]").astype(np.int64), "ns"
         if array.dtype.kind in "UO" and array.ndim == 1 and len(array) > 1 and all(isinstance(each, str) for each in array):
             if tells_apart(leaf_of(name)):
                 self.add_labels(name, array.tolist())

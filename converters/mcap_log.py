@@ -182,6 +182,7 @@ def _read_parts(sequence: Sequence, images: bool) -> MessageLog:
     """Message log of the parts of a ROS 2 bag, one after the other; an unfinished one is read up to its end."""
     paths, remarks, counts = _parts(sequence.path), Remarks(), Counter[str]()
     topics: dict[str, MessageTopic] = {}
+    metadata: dict[str, dict[str, str]] = {}
     sources = []
     remarks.notes.append(f"the bag has no {METADATA}; read in this order: {', '.join(path.name for path in paths)}")
     for path in paths:
@@ -192,6 +193,8 @@ def _read_parts(sequence: Sequence, images: bool) -> MessageLog:
             remarks.notes += [note for note in part.remarks.notes if note not in remarks.notes]
             remarks.losses += part.remarks.losses
             counts.update(part.counts)
+            for name, values in part.metadata.items():
+                metadata.setdefault(name, {}).update(values)
             found, messages = part.topics, part.messages
         else:
             messages = partial(_unfinished, path, images)
@@ -206,7 +209,7 @@ def _read_parts(sequence: Sequence, images: bool) -> MessageLog:
         topics=tuple(topics.values()),
         messages=lambda: chain.from_iterable(messages() for messages in sources),
         counts=counts,
-        metadata={"imutool": {"format": "mcap_log", "sequence": sequence.name}},
+        metadata=metadata | {"imutool": {"format": "mcap_log", "sequence": sequence.name}},
         remarks=remarks,
     )
 

@@ -57,26 +57,28 @@ def find_stamps(log: Log, notes: Mapping[str, list[str]]) -> dict[str, Int64[np.
     stamps: dict[str, Int64[np.ndarray, "..."]] = {}
     clock: dict[str, int] = {}
     for topic in filter(lambda name: _has_stamp(log.topics[name]), log.imu_topics):
-        log_ns, before = _times(raw_batches(log, topic))
+        log_ns, recorded = _times(raw_batches(log, topic))
+        before = _set(log_ns, recorded)
         found = read_stamps(before)
         late_stamps = log_ns if found.unset else before
         stamps[topic] = restamped(late_stamps)
         moved_s = 1e-9 * float(np.abs(stamps[topic] - late_stamps).max(initial=0))
         under = "the log times" if found.unset else "them"
         line = f"stamps are now on a line under {under}, moved by {moved_s:.6f} s at most"
-        notes[topic].append("; ".join([*found.faults, line]))
+        notes[topic].append("; ".join([*_unset(recorded, before), *found.faults, line]))
         if found.wraps and not clock:
             clock = {"size_ns": WRAPS[found.wraps.most_common(1)[0][0]], "late_ns": int(log_ns[0] - found.stamp_ns[0])}
     for described in log.with_schema((*MESSAGE_POSES, schemas.VECTOR3)):
         if described.message_encoding in ENCODINGS and described.reflected is None:
             every = partial(described.decode_poses, lost=True)
             decode = every if described.schema_name in MESSAGE_POSES else described.decode_scalars
-            log_ns, before = _times(batch for _, rows in log.rows([described.name]) for batch in decode(rows))
+            log_ns, recorded = _times(batch for _, rows in log.rows([described.name]) for batch in decode(rows))
+            before = _set(log_ns, recorded)
             found = read_stamps(before)
             whole_ns = log_ns if found.unset else _unwrapped(log_ns, before, **clock)
-            if (whole_ns != before).any():
+            if (whole_ns != recorded).any():
                 stamps[described.name] = whole_ns
-                faults = "; ".join(found.faults) or "stamps start after a wrap"
+                faults = "; ".join([*_unset(recorded, before), *found.faults]) or "stamps start after a wrap"
                 notes[described.name].append(f"{faults}; they {'are the log times' if found.unset else 'run on'} now")
     return stamps
 
@@ -92,6 +94,20 @@ def _times(batches: Iterator[ImuBatch | PoseBatch | ScalarBatch]) -> Int64[np.nd
     """Log times and stamps of a topic, in file order."""
     every = [np.stack([batch.log_time.astype(np.int64), batch.stamp_ns]) for batch in batches]
     return np.concatenate([np.zeros((2, 0), np.int64), *every], axis=1)
+
+
+def _set(log_ns: Int64[np.ndarray, " n"], stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+    """Stamps of which those of 0 among others, as of a driver that waits for its clock, are where the log times put them."""
+    lags = np.sort((log_ns - stamp_ns)[stamp_ns != 0])
+    if not len(lags):
+        return stamp_ns
+    there = log_ns - lags[len(lags) // 2]
+    return np.where((stamp_ns == 0) & (np.abs(there) > SAME_CLOCK_NS), there, stamp_ns)
+
+
+def _unset(recorded: Int64[np.ndarray, " n"], stamp_ns: Int64[np.ndarray, " n"]) -> list[str]:
+    count = int((recorded != stamp_ns).sum())
+    return [f"stamps that were not set: {count}"] if count else []
 
 
 def _unwrapped(

@@ -62,6 +62,15 @@ def test_messages_that_share_a_stamp_are_told_of_and_restamped(stamps: np.ndarra
     assert np.array_equal(even.gyro, VALUES[:, :3])
 
 
+def test_first_stamps_that_were_not_set_are_where_the_log_times_put_them(tmp_path: Path) -> None:
+    """A driver publishes before it has the time; its clock may be another than the log's."""
+    own = T_NS - START_NS + 3_600 * 10**9
+    stamps = np.where(np.arange(2000) < 7, 0, own)
+    report = convert(logged(tmp_path / "in.mcap", stamps), tmp_path / "out.mcap", restamp=True)
+    assert np.abs(read(tmp_path / "out.mcap").imu.t_ns - own).max() <= 0.01 * MS
+    assert any("/imu0: stamps that were not set: 7; stamps are now on a line" in note for note in report.notes)
+
+
 def test_stamps_of_their_own_repeated_messages_and_stamps_never_set_are_no_shared_ones(tmp_path: Path) -> None:
     assert not convert(logged(tmp_path / "own.mcap", T_NS), tmp_path / "a.mcap").notes
     twice = np.repeat(np.arange(1000), 2)

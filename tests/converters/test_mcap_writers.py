@@ -31,6 +31,7 @@ NO_INDEX: dict[str, Any] = {
 def write_log(path: Path, topics: tuple[str, ...] = ("/imu",), *, beside: bool = False, **options: Any) -> Path:
     """Log of the same samples on each topic, with two metadata records of one name and an attachment on request."""
     rows = encode_imu(T_NS, GYRO, ACCEL, "imu")
+    path.parent.mkdir(exist_ok=True)
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=10_000, **options)
         writer.start("ros2")
@@ -92,3 +93,13 @@ def test_an_imu_that_never_sent_a_message_is_no_choice(tmp_path, options):
         writer.finish()
     assert read(tmp_path / "in.mcap").imu_topic == "/imu"
     assert len(read(tmp_path / "in.mcap", imu="/spare/imu").imu) == 0
+
+
+def test_metadata_of_each_part_of_a_bag_are_kept(convert, tmp_path):
+    for number in range(2):
+        write_log(tmp_path / "bag" / f"run_{number}.mcap", beside=number == 0)
+    assert convert(tmp_path / "bag", tmp_path / "out.mcap").returncode == 3
+    with (tmp_path / "out.mcap").open("rb") as file:
+        found = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
+    assert found["rig"] == {"camera": "left", "mount": "roof"}
+    assert "attachments are not carried over: calibration.yaml" in found["imutool/remarks"].values()

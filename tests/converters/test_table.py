@@ -248,6 +248,27 @@ def as_hdf5(path: Path) -> None:
         file["imu/time_ns"], file["imu/angular_velocity"], file["imu/linear_acceleration"] = T_NS, GYRO, ACCEL
 
 
+@pytest.mark.parametrize("kind", ["M8[ns]", "m8[ns]"])
+@pytest.mark.parametrize("ending", ["npz", "npy", "parquet"])
+def test_dates_and_times_of_numpy_are_times(tmp_path, kind, ending):
+    names = ("time", *CERTAIN[1:])
+    values = dict(zip(names, (T_NS.astype(kind), *arrays()[1:]), strict=True))
+    path = tmp_path / f"log.{ending}"
+    if ending == "npz":
+        np.savez(path, **values)
+    elif ending == "npy":
+        np.save(path, np.rec.fromarrays([*values.values()], names=[*values]))
+    else:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        pq.write_table(pa.table(values), path)
+    (sequence,) = table.sequences(path)
+    imu = table.read_sequence(sequence).imus["/imu0"]
+    assert imu.t_ns.tolist() == T_NS.tolist()
+    assert np.array_equal(imu.gyro, GYRO)
+
+
 @pytest.mark.parametrize("write", [as_npz, as_parquet, as_mat, as_hdf5])
 def test_every_file_format_gives_the_same_imu(convert, tmp_path, write):
     with (tmp_path / "recording").open("wb"):

@@ -172,3 +172,13 @@ def test_a_rate_beside_the_samples_of_one_sensor_is_theirs(tmp_path):
     (tmp_path / "log.json").write_text(json.dumps(document))
     log = table.read_sequence(table.sequences(tmp_path / "log.json")[0], mapping={"gyro_unit": "rad/s"})
     assert log.imus["/imu0"].t_ns.tolist() == [n * 20_000_000 for n in range(COUNT)]
+
+
+@pytest.mark.parametrize("lines", [False, True])
+def test_not_a_number_as_python_writes_it_is_a_missing_value(tmp_path, lines):
+    rows = [row | {"temperature": float("nan") if n % 3 else 20.0} for n, row in enumerate(FLAT)]
+    log = read(tmp_path / "log.json", "\n".join(map(json.dumps, rows)) if lines else json.dumps(rows))
+    assert np.array_equal(log.imus["/imu0"].gyro, GYRO)
+    assert len(log.scalars["/temperature"]) == len(rows[::3])
+    with pytest.raises(DataError, match="begins as JSON and cannot be read"):
+        read(tmp_path / "cut.json", json.dumps(rows)[:-20].replace("},", ","))
