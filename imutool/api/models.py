@@ -17,7 +17,6 @@ from imutool.bias import static
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import find_model, shipped_for
 from imutool.bias_start import Fitness
-from imutool.bias_start.bias_at_rest import at_rest
 from imutool.bias_start.correction import apply_with_std
 from imutool.bias_start.earlier_load import switched_on_before
 from imutool.bias_start.fitness import CHECKED_S, judge
@@ -91,7 +90,7 @@ def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     imu.check_rate("imu")
     if wrong := unusual_gravity(imu.accel) if len(imu) else "":
         raise DataError(wrong, where="imu", expected="samples in rad/s and m/s²")
-    return at_rest(model, imu)
+    return find_initial_bias("stationary", model, Recording("imu", imu))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -69,7 +69,9 @@ def find_initial_bias(init: str, model: BiasModel, recording: Recording) -> Init
         DataError: `stationary` on a log that does not start at rest, `truth` without truth at its start, or `auto` with an
             untrained model and no stationary stretch.
     """
-    recording = replace(recording, imu=without_drift(model, recording.imu))
+    good = measured(recording.imu.gyro, recording.imu.accel)
+    imu = recording.imu if good.all() else recording.imu.rows(good)
+    recording = replace(recording, imu=without_drift(model, imu))
     if init == "prior":
         return replace(tracked_from_prior(model, int(recording.imu.t_ns[0])), how=PRIOR, follows=None)
     if init == "truth" or init.startswith("truth:"):

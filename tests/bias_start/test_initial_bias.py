@@ -597,6 +597,19 @@ def test_each_word_finds_its_way(biased: Recording) -> None:
         find_initial_bias("auto", static.Model(), moving)  # no training runs, no prior to fall back on
 
 
+@pytest.mark.parametrize("way", ["auto", "stationary", "truth"])
+def test_samples_without_specific_force_are_no_start(biased: Recording, way: str) -> None:
+    """As a driver sends them until the accelerometer runs; a log has none of them, an array may."""
+    whole = biased if way == "truth" else Recording("still", resting([(0.0, 12.0)])[0])
+    begun, imu = round((2.0 if way == "truth" else 6.0) * RATE_HZ), whole.imu
+    silent = np.where(np.arange(len(imu))[:, None] < begun, 0.0, imu.accel)
+    given, cut = (replace(whole, imu=part) for part in (replace(imu, accel=silent), imu.rows(slice(begun, None))))
+    found, expected = (find_initial_bias(way, trained(prior_std=0.05, truth_std=1e-3), part) for part in (given, cut))
+    for name in ("rest", "std", "noise"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert (found.how, found.hold_s) == (expected.how, expected.hold_s)
+
+
 def test_a_start_does_not_share_memory_with_the_model() -> None:
     made = model(mean=0.1)
     start = prior(made)
