@@ -41,7 +41,7 @@ Tell = Callable[[int, int, str], None]
 class VioSettings(config.Settings, frozen=True, kw_only=True):
     """Camera, tracks and smoother of one comparison."""
 
-    keyframes_hz: Positive = 4.0  # rate of the images that are used
+    keyframes_hz: Annotated[float, Meta(gt=0.0, le=1000.0)] = 4.0  # rate of the images that are used
     features: Annotated[int, Meta(ge=1)] = 30  # tracks at a keyframe
     pixel_noise: Positive = 1.0  # px, of each coordinate; the smoother knows it
     blackout_s: Annotated[float, Meta(ge=0.0)] = 0.0  # the camera sees nothing this long ...

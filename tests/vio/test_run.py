@@ -173,6 +173,7 @@ def test_a_missing_extra_ends_the_command_with_3(
     ("words", "told"),
     [
         (("--keyframes", "0"), "keyframes_hz"),
+        (("--keyframes", "1e9"), "keyframes_hz"),  # more of them than memory holds
         (("--features", "0"), "features"),
         (("--set", "blackout_evry_s=3"), "Did you mean blackout_every_s?"),
     ],
