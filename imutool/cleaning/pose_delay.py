@@ -18,6 +18,7 @@ MOST_POSES = 2000  # evenly taken from a longer log
 LONGEST_DELAY_S, FINE_S = 2.0, 0.01
 SLOW_S = 1.0  # length of the turns that find the delay: in steps of 0.1 s a fast walk fits one stride later as well
 FINE_LAGS_S = FINE_S * np.arange(-12, 13)
+REPEATED = 1.5  # times what the best delay leaves: of motion that repeats, another one leaves hardly more
 LEAST_CORRELATION, WEAK = 0.8, 0.5  # of the whole log, and of a part
 LEAST_SHARED, MOST_STEPS = 300, 72_000  # steps of 0.1 s that two clocks share, and of a log that is searched for them
 SHARES = 1.0, 0.95  # of the turns that count with their own length; longer ones, as where markers are exchanged, are cut to it
@@ -126,7 +127,7 @@ def _searched(slow: _Turns, fast: _Turns, longest_s: float, count: int, start_ns
     if count == DELAY_PARTS and (stepped := _stepped(slow, fast, coarse, slowly, start_ns)) is not None:
         return stepped
     whole = slowly[:, 0]
-    at = int(np.argmax(whole))
+    at = _best(coarse, whole)
     if whole[at] < LEAST_CORRELATION or at in (0, len(coarse) - 1):
         return None
     lags = coarse[at] + FINE_LAGS_S
@@ -138,6 +139,17 @@ def _searched(slow: _Turns, fast: _Turns, longest_s: float, count: int, start_ns
     if not np.isfinite(peaks[0]) or len(parts) < FEWEST_PARTS:
         return None
     return Delay(float(peaks[0]), _scatter(parts) / len(parts) ** 0.5)
+
+
+def _best(lags: Float64[np.ndarray, " l"], values: Float64[np.ndarray, " l"]) -> int:
+    """Place of the largest correlation, or of the peak nearest to no delay among those that are nearly as large.
+
+    A pendulum fits as well a swing later.
+    """
+    left, largest = 1.0 - values**2, int(np.argmax(values))
+    peaks = np.flatnonzero((values[1:-1] >= np.maximum(values[:-2], values[2:])) & (values[1:-1] > 0.0)) + 1
+    alike = peaks[left[peaks] <= REPEATED * left[largest]]
+    return min((largest, *alike.tolist()), key=lambda place: abs(float(lags[place])))
 
 
 def _scatter(parts: Float64[np.ndarray, " p"]) -> float:
@@ -153,7 +165,8 @@ def _stepped(
     slow: _Turns, fast: _Turns, coarse: Float64[np.ndarray, " l"], slowly: Float64[np.ndarray, "l p"], start_ns: int
 ) -> Delay | None:
     """Delay of the larger side of a step, which parts show whose own delays are alike on each side of it alone."""
-    own = np.where(slowly.max(axis=0) < LEAST_CORRELATION, np.nan, coarse[np.argmax(slowly, axis=0)])[1:]
+    best = [_best(coarse, column) for column in slowly.T]
+    own = np.where(slowly.max(axis=0) < LEAST_CORRELATION, np.nan, coarse[best])[1:]
     parts = np.full(DELAY_PARTS, np.nan)
     for centre in np.unique(own[np.isfinite(own)]):
         fine = fast.correlations(centre + FINE_LAGS_S, DELAY_PARTS)[:, 1:]
