@@ -10,8 +10,9 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, ForwardRef, NamedTuple, TypeAlias
 from urllib.parse import unquote, urlsplit
@@ -200,6 +201,18 @@ def same_location(a: Location, b: Location) -> bool:
     if isinstance(a, Path) and isinstance(b, Path):
         return a.exists() and b.exists() and a.samefile(b)
     return a == b
+
+
+def refuse_twins(logs: Sequence[Location], parameter: str) -> None:
+    """Refuse a log that is given twice, also through a link: its samples would count as those of two.
+
+    Raises:
+        ConfigError: with both names.
+    """
+    for first, second in combinations(logs, 2):
+        if same_location(first, second):
+            what = f"{first} and {second} are one log" if first != second else f"{first} is given twice"
+            raise ConfigError(what, where=parameter, expected="each log once")
 
 
 def identity(where: Location) -> tuple[int, str]:

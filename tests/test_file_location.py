@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from support.in_process import run_command
 
+import imutool as api
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError, redact
 from imutool.file_location import BLOCK_BYTES, reason, same_location, to_location
@@ -269,6 +270,19 @@ def test_a_web_server_s_log_is_debiased_as_the_file_is_under_its_own_name(logs: 
         report = debias(log, tmp_path / "out.mcap", model=model)
         server.shutdown()
     assert report.rewrite.added == debias(file, tmp_path / "b.mcap", model=model).rewrite.added
+
+
+@pytest.mark.parametrize("words", [["train", "-o", "m.safetensors"], ["diagnose"]])
+def test_a_log_that_is_given_twice_is_refused(imutool: Any, tmp_path: Path, logs: Path, words: list[str]) -> None:
+    """Its samples counted twice: deviations became too small, and a left-out log was trained on."""
+    (tmp_path / "a.mcap").symlink_to(logs / "flight_1.mcap")
+    (tmp_path / "b.mcap").symlink_to(tmp_path / "a.mcap")
+    done = imutool(words[0], "a.mcap", "b.mcap", *words[1:], cwd=tmp_path)
+    assert done.returncode == ConfigError.exit_code
+    assert "a.mcap and b.mcap are one log; expected each log once" in done.stderr
+    run = api.diagnose if words == ["diagnose"] else partial(api.train, out=tmp_path / "m.safetensors")
+    with pytest.raises(ConfigError, match="is given twice"):
+        run([tmp_path / "a.mcap", str(tmp_path / "a.mcap")])
 
 
 def test_a_name_with_a_zero_byte_is_said() -> None:

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 from imutool.errors import ConfigError, ImutoolError
-from imutool.file_location import Location, LogPath, location, several
+from imutool.file_location import Location, LogPath, location, refuse_twins, several
 
 if TYPE_CHECKING:
     from imutool.recording import Recording
@@ -95,7 +95,7 @@ def given_logs(
     No error names such a file.
 
     Raises:
-        ConfigError: none is given, or one is neither a path nor a recording.
+        ConfigError: none is given, one is given twice, or one is neither a path nor a recording.
         DataError: a recording without samples, or of a rate that is none.
     """
     from imutool.mcap_io.write import write
@@ -115,6 +115,7 @@ def given_logs(
                 places.append(location(log))
         if len(places) < least:
             raise ConfigError("no log is given", where=parameter, expected="one or more")
+        refuse_twins(places, parameter)
         try:
             yield GivenLogs(places, names)
         except ImutoolError as error:

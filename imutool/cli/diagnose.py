@@ -67,8 +67,10 @@ def diagnose(
     from imutool.config import load as load_settings
     from imutool.diagnosis.closed_loop import script_metric
     from imutool.diagnosis.settings import DiagnoseSettings
+    from imutool.file_location import refuse_twins
     from imutool.processes.forked import forking
 
+    refuse_twins(reals, "reals")
     settings = load_settings(DiagnoseSettings, config, set_ or ())
     with forking(), common.progress("Diagnosing") as tell:
         diagnosis, remarks = diagnosis_output.diagnose(

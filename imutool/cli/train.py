@@ -46,7 +46,7 @@ def train(
     """Train a bias model on logs of one sensor with true poses."""
     registry.load("imutool.bias", method, "method")  # refuse a wrong name before reading any log
     from imutool.config import load
-    from imutool.file_location import local
+    from imutool.file_location import local, refuse_twins
     from imutool.processes.forked import forking
     from imutool.training.run import train as run
     from imutool.training.settings import full_name, settings_of
@@ -57,6 +57,7 @@ def train(
         if left:
             logging.getLogger("imutool").warning("left to the neural ODE: %s", ", ".join(left))
     words += [*(set_ or ()), *([f"seed={seed}"] if seed is not None else ())]
+    refuse_twins(logs, "logs")
     settings = load(settings_of(method), config, [full_name(method, word) for word in words])
     with forking(), common.progress("Training") as tell:
         trained = run(
