@@ -332,6 +332,19 @@ def test_late_poses_of_a_walking_robot_are_not_a_stride_later(hz: float) -> None
     assert found.delay.seconds == pytest.approx(0.03, abs=0.015)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_late_poses_of_a_pendulum_are_not_a_swing_later(seed: int) -> None:
+    """Its swings of 3 s are alike but for a small part."""
+    t, rng = np.arange(40 * RATE_HZ) / RATE_HZ, np.random.default_rng(seed)
+    swing, other = 2.0 * np.sin(2.0 * np.pi / 3.0 * t), 0.03 * rng.normal(size=(2, len(t))).cumsum(axis=1) / RATE_HZ**0.5
+    imu, poses = turned(np.column_stack([swing, *other]), noise=0.2)
+    truth = of_poses("/truth", poses)
+    assert truth is not None
+    found = judge(motion_of(imu), truth._replace(t_ns=truth.t_ns + 30_000_000), 1.0)
+    assert found.delay is not None
+    assert found.delay.seconds == pytest.approx(0.03, abs=0.03)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_poses_of_another_motion_have_no_clock_in_common(seed: int) -> None:
     imu, _ = turned(waves(90.0, (0.5, 0.4, 0.6), seed))
