@@ -204,7 +204,7 @@ def same_location(a: Location, b: Location) -> bool:
 
 
 def refuse_twins(logs: Sequence[Location], parameter: str) -> None:
-    """Refuse a log that is given twice, also through a link: its samples would count as those of two.
+    """Refuse a log that is given twice, also through a link: it would count as two.
 
     Raises:
         ConfigError: with both names.

@@ -148,8 +148,8 @@ def _best(lags: Float64[np.ndarray, " l"], values: Float64[np.ndarray, " l"]) ->
     """
     left, largest = 1.0 - values**2, int(np.argmax(values))
     peaks = np.flatnonzero((values[1:-1] >= np.maximum(values[:-2], values[2:])) & (values[1:-1] > 0.0)) + 1
-    alike = peaks[left[peaks] <= REPEATED * left[largest]]
-    return min((largest, *alike.tolist()), key=lambda place: abs(float(lags[place])))
+    alike = np.append(peaks[left[peaks] <= REPEATED * left[largest]], largest)
+    return int(alike[np.argmin(np.abs(lags[alike]))])
 
 
 def _scatter(parts: Float64[np.ndarray, " p"]) -> float:

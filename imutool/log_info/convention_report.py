@@ -90,8 +90,8 @@ def _pose_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
     """Warnings of poses that do not turn as the gyro does, or are too far apart to show it."""
     if whole.truth is None:
         return []
-    sparse, turns = sparse_warnings(whole.truth), found.turns[whole.truth.topic].agreement()
-    if turns is None:
+    sparse, compared = sparse_warnings(whole.truth), found.turns.get(whole.truth.topic)
+    if compared is None or (turns := compared.agreement()) is None:
         return sparse
     topic, turned_deg = whole.truth.topic, [] if turns.turned is None else turns.turned.deg.tolist()
     seen = turns.explained, turns.rms_rad_s, turns.jumps, turns.largest_jump_deg
