@@ -23,6 +23,7 @@ from imutool.viewing.rerun.connect import Listener
 
 NO_WAIT_S = 2.0
 SERVER_STARTS_S = 10.0
+BUSY_S = 3.0  # until a server answers, on a machine with other work
 
 
 class Unread(http.server.BaseHTTPRequestHandler):
@@ -53,8 +54,9 @@ def dead() -> str:
 
 
 @pytest.fixture
-def received(tmp_path: Path) -> Iterator[tuple[str, Path, subprocess.Popen[bytes]]]:
+def received(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, Path, subprocess.Popen[bytes]]]:
     """A server that speaks as a viewer does, has none, and keeps what it is sent: its URL, the file and its process."""
+    monkeypatch.setattr(connect, "ANSWER_TIMEOUT_S", BUSY_S)
     port, file = viewer.free_port(), tmp_path / "received.rrd"
     process = viewer.run("--save", str(file), "--port", str(port))
     assert viewer.listens(process, port, SERVER_STARTS_S)

@@ -112,6 +112,7 @@ def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, display: None) -> 
     )
     script.chmod(script.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setattr(viewer, "binary", lambda: script)
+    monkeypatch.setattr(viewer, "START_TIMEOUT_S", LONG_S)  # on a busy machine
 
     def end() -> Path:
         process, size, still_s = viewer.VIEWERS[-1], -1, 0.0
