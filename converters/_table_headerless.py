@@ -57,7 +57,7 @@ class _Halves(NamedTuple):
 
 
 def perhaps(columns: Columns) -> list[str]:
-    """Lines of a map for columns of no names, of which the first look like an IMU."""
+    """Lines of a map for columns without names, of which the first look like an IMU."""
     groups: dict[str, list[str]] = {}
     for name in columns.values:
         if match := re.fullmatch(r"(.*/)?(column \d{1,4}|time)", name) or re.fullmatch(r"(.*)\[\d{1,4}\]", name):

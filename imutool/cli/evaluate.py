@@ -101,7 +101,7 @@ def evaluate(
     from imutool.evaluation import evaluate as run
 
     if trajectories is not None and len(logs) > 1:
-        _refuse_twins(logs)
+        _refuse_one_name(logs)
     if report is not None:
         from imutool.viewing.html import report as pages
         from imutool.viewing.html.drawing import require_matplotlib
@@ -139,7 +139,7 @@ def evaluate(
         raise errors[0]
 
 
-def _refuse_twins(logs: Sequence[Path]) -> None:
+def _refuse_one_name(logs: Sequence[Path]) -> None:
     """Refuse two logs of one name, before any work: they would write the same trajectories (ConfigError)."""
     from imutool.file_location import log_name
     from imutool.mcap_io.log import Log

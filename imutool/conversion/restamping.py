@@ -97,7 +97,7 @@ def _times(batches: Iterator[ImuBatch | PoseBatch | ScalarBatch]) -> Int64[np.nd
 
 
 def _set(log_ns: Int64[np.ndarray, " n"], stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-    """Stamps of which those of 0 among others, as of a driver that waits for its clock, are where the log times put them."""
+    """Stamps, of which those that a driver left at 0, while it waited for its clock, follow the log times."""
     lags = np.sort((log_ns - stamp_ns)[stamp_ns != 0])
     if not len(lags):
         return stamp_ns

@@ -33,6 +33,7 @@ from imutool.recording import GRAVITY_M_S2, Imu, Recording
 
 logger = logging.getLogger(__name__)
 
+FIX_BY_HAND = BY_HAND[0].upper() + BY_HAND[1:]
 QUATERNIONS = "quaternions of poses"  # said only where they are misread
 START_LATE_S = 0.015  # half of what is a warning; a start from poses 10 ms late is off by about its standard deviation
 LEAST_VERTICAL = 0.85  # of gravity along the z of the poses, in the mean: 32 degrees
@@ -174,7 +175,7 @@ def _correction(warning: str, truth: Truth | None) -> str:
 
 def _apart(warning: str, truth: Truth | None) -> tuple[str, str]:
     """A warning without what to do, and that; empty where it says nothing to do."""
-    for fix, said in ((CORRECTION, _correction(warning, truth)), (BY_HAND, BY_HAND[0].upper() + BY_HAND[1:])):
+    for fix, said in ((CORRECTION, _correction(warning, truth)), (BY_HAND, FIX_BY_HAND)):
         if warning.endswith(fix):
             return warning.removesuffix(f"; {fix}"), said
     return warning, ""
@@ -223,7 +224,7 @@ def check_motion(motion: ImuMotion, truth: Truth | None, where: str) -> None:
         what, fix = _apart(warning, truth)
         if fix or warning in wrong:
             expected = "units, axes and poses that agree"
-            raise DataError(what, where=where, expected=expected, fix=fix or BY_HAND[0].upper() + BY_HAND[1:])
+            raise DataError(what, where=where, expected=expected, fix=fix or FIX_BY_HAND)
         logger.warning("%s: %s", where, warning)
 
 

@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 LEAST_TURNS = 20  # between poses
 LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
 LEAST_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be reported
-LESS_TURNED = 1.0 / 3.0  # of what poses leave of the gyro's motion as they are, the part that a turned body leaves
+LESS_TURNED = 1.0 / 3.0  # at most, of what the poses leave of the gyro's motion as recorded, remains with a turned body
 UNLIKE_RAD_S = 0.1  # rms that poses leave of the gyro's motion; EuRoC, TUM-VI and FETCH explain at least 91 %
 JUMP_DEG, JUMP_MEDIANS, JUMP_SHARE = 5.0, 10.0, 0.2  # misfit of a turn in 0.1 s; by the usual misfit; of the gyro's turn
 LEAST_JUMPS_DEG = 15.0  # their sum, below which one is no news
@@ -158,7 +158,7 @@ def turned_somehow(explained: float, as_recorded: float) -> bool:
 
 
 def body_warnings(topic: str, turned_deg: Sequence[float], explained: float, as_recorded: float) -> list[str]:
-    """Warning of poses whose body is turned far against the gyro, known how or not."""
+    """Warning of poses whose body is turned far, also where the motion does not show how."""
     if not len(turned_deg) and turned_somehow(explained, as_recorded):
         said = f"the poses {topic} turn as the gyro does only with their body turned, and the motion does not show how"
         return [f"{said}: turns about one axis, as of a vehicle; {BY_HAND}"]

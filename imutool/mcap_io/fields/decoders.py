@@ -92,7 +92,7 @@ def decoder_of(log: Log, topic: Topic) -> Decoder:
 
 
 def _check_alone(log: Log, topic: Topic, definition: Definition, parse: Callable[[str, bytes], Definition]) -> None:
-    """Refuse a topic whose channels lay out messages of one name in several ways, as logs that were merged do.
+    """Refuse a topic whose channels define messages of one name differently, as in merged logs.
 
     Raises:
         LogError: they do.
