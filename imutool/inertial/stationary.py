@@ -176,11 +176,12 @@ class OnlineRestDetector:
 
     def __call__(self, gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"], *, whole: bool = True) -> bool:
         """Whether the sensor rests for `min_s` up to the last sample; `whole` if no sample is missing."""
-        k = len(gyro) // self.parts
-        if k < 2 or not whole:
+        parts = min(self.parts, len(gyro) // 2)  # fewer below 20 Hz
+        if parts < 2 or not whole:
             self._last, self._resting = None, 0
             return False
-        cut = np.concatenate([gyro, accel], axis=1)[: k * self.parts].reshape(self.parts, k, 6)
+        k = len(gyro) // parts
+        cut = np.concatenate([gyro, accel], axis=1)[: k * parts].reshape(parts, k, 6)
         mean = cut.sum(axis=1) / k
         away = cut - mean[:, None]
         var = np.einsum("pki,pki->pi", away, away) / (k - 1)  # `np.var` takes the mean again

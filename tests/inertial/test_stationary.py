@@ -210,7 +210,15 @@ def test_missing_samples_and_short_blocks_begin_it_anew():
     still = OnlineRestDetector()
     answers = [still(gyro[a : a + 100], accel[a : a + 100], whole=a != 400) for a in range(0, 800, 100)]
     assert answers == [False, False, True, True, False, False, False, True]
-    assert not any(told(gyro, accel, block=5))
+    assert not any(told(gyro, accel, block=3))
+
+
+@pytest.mark.parametrize("block", [4, 5, 8])  # half a second at 8, 10 and 16 Hz
+def test_a_slow_sensor_rests_too(block: int) -> None:
+    _, gyro, accel = made(10.0)
+    moving = gyro + 0.3 * np.sin(0.7 * np.arange(len(gyro)) / block)[:, None]
+    assert np.mean(told(gyro, accel, block)) > 0.8
+    assert not any(told(moving, accel, block))
 
 
 def test_it_agrees_with_the_whole_log_on_real_recordings(data):
