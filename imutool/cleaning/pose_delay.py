@@ -27,6 +27,7 @@ DELAY_PARTS, FEWEST_PARTS = 8, 4  # parts whose own lags show how sure the delay
 SCALE_STEPS, GAUSS = 20, 1.4  # steps to Student's scale of a few parts, and by how much it is below a Gaussian's deviation
 SEARCHES = (LONGEST_DELAY_S, 40, DELAY_PARTS), (0.5, 20, FEWEST_PARTS)  # longest delay, poses in each part, most parts
 STEP_LEAST_S, STEP_STDS = 0.03, 8.0  # of a step of one clock, at least; and in deviations of the parts on each side
+STEP_CLEAR = 3.0  # of each side, the logarithm of a likelihood ratio of its own delay to the other's, with a sample each second
 
 
 class Step(NamedTuple):
@@ -180,7 +181,7 @@ def _stepped(
         before_s, after_s = (float(median(side)) for side in sides)
         left = np.concatenate([sides[0] - before_s, sides[1] - after_s])
         std_s = float(np.sqrt((left**2).sum() / (len(left) - 2)))
-        if abs(after_s - before_s) > max(STEP_LEAST_S, STEP_STDS * std_s):
+        if abs(after_s - before_s) > max(STEP_LEAST_S, STEP_STDS * std_s) and fast.tell_apart(before_s, after_s, within):
             at_ns = start_ns + round(1e9 * float(np.array_split(fast.first_s, DELAY_PARTS)[within][0]))
             larger = int(len(sides[1]) > len(sides[0]))
             delay_s = (before_s, after_s)[larger]
@@ -225,6 +226,15 @@ class _Turns(NamedTuple):
         measured = _cut(np.stack([np.linalg.norm(mean, axis=1) for mean in means]), self.share)
         parts = zip(np.array_split(self.size, count), np.array_split(measured, count, axis=1), strict=True)
         return np.stack([_correlations(self.size, measured), *(_correlations(*part) for part in parts)], axis=1)
+
+    def tell_apart(self, before_s: float, after_s: float, within: int) -> bool:
+        """Whether the parts before and those after one of them each fit their own delay clearly better than the other's."""
+        before, after = np.log(
+            1.0 - np.square(self.correlations(np.array([before_s, after_s]), DELAY_PARTS)[:, 1:]).clip(max=1.0 - 1e-9)
+        )
+        spans_s = np.array([np.ptp(part) for part in np.array_split(self.first_s, DELAY_PARTS)])
+        gain = 0.5 * spans_s * (after - before)
+        return bool(min(gain[:within].sum(), -gain[min(within + 1, DELAY_PARTS - 1) :].sum()) > STEP_CLEAR)
 
 
 def _correlations(a: Float64[np.ndarray, " n"], rows: Float64[np.ndarray, "l n"]) -> Float64[np.ndarray, " l"]:

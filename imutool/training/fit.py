@@ -3,7 +3,8 @@
 What a step descends on is the objective's to say (`imutool.training.objectives`), and it mixes all logs. Beside the sensor's
 weights each log has a slow track of its own rest bias, so that what belongs to a run cannot be mistaken for the sensor's. What
 is kept is the running mean over the last steps; or the closed form, if that drifts less over the longest windows of the
-held-out part. A choice among many steps would be made by the noise of that part, which may be seconds long.
+held-out part, or if the bias of a log runs away within an hour. A choice among many steps would be made by the noise of that
+part, which may be seconds long.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from imutool.recording import Recording
 from imutool.training import bias_spread
 from imutool.training.calibration import closed_form
 from imutool.training.calibration.last_layer import solve_last_layer
-from imutool.training.held_out import held_out_errors
+from imutool.training.held_out import held_out_errors, runs_away
 from imutool.training.log_signals import begin_at
 from imutool.training.objectives.increments import IncrementObjective
 from imutool.training.objectives.objective import AdamW, Objective, RestBiases, WindowEndObjective
@@ -135,10 +136,12 @@ class Training:
                 self._closed_form(sensor)
                 self.stage = self.begin(sensor)
             last = yield from self._descend(self.stage)
-            better = last <= self.stage.before
-            self.model.load_state_dict(self.stage.mean.module.state_dict() if better else self.stage.closed_form)
+            if kept := last <= self.stage.before and not self._runs_away(self.stage):
+                self.model.load_state_dict(self.stage.mean.module.state_dict())
+            else:
+                self.model.load_state_dict(self.stage.closed_form)
             self.stage.objective.settle()
-            self.done[sensor], self.stage = min(last, self.stage.before), None
+            self.done[sensor], self.stage = last if kept else self.stage.before, None
         if statistics:
             self.store_statistics()
 
@@ -258,6 +261,11 @@ class Training:
         # for a GPU that is not there torch.manual_seed would note down each time where it was called from
         drawing = torch.default_generator if self.pool.t.device.type == "cpu" else torch
         drawing.manual_seed((self.settings.seed + SEED_STRIDE * (stage.step + 1)) % 2**63)
+
+    def _runs_away(self, stage: Stage) -> bool:
+        model = stage.mean.module
+        assert isinstance(model, BiasNetwork)
+        return not model.forgets and runs_away(model, stage.sensor, self.pool, self.tracks.per_log().detach())
 
     def _validate(self, stage: Stage) -> float:
         model = stage.mean.module

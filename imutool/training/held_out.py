@@ -1,7 +1,8 @@
-"""Errors of a model over the held-out parts of its training logs."""
+"""Whether a model may be kept: its errors over the held-out parts of its training logs, and its drift over an hour."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -9,9 +10,10 @@ from torch import Tensor
 
 from imutool.array_types import Float, Int
 from imutool.bias.model import COLUMNS
-from imutool.bias.networks.network import BiasNetwork
+from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.networks.threads import of_each
 from imutool.errors import DataError
+from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.calibration import closed_form
 from imutool.training.objectives.objective import BATCH_SAMPLES, error
 from imutool.training.training_windows import Pool, corrected, sensors_up_to
@@ -19,6 +21,7 @@ from imutool.units import Sensor
 
 LONGEST_S = {"gyro": 20.0, "accel": 5.0}
 HOP_S = 1.0
+HOUR_S = 3600.0
 
 
 def held_out_errors(
@@ -42,6 +45,27 @@ def held_out_errors(
         parts = torch.split(first, max(1, BATCH_SAMPLES // n))
         errors = of_each(lambda some: error(scored, sensor, pool.windows(some, n, rest[pool.log[some]])), parts)
     return torch.cat(errors), pool.log[first]
+
+
+@torch.no_grad()
+def runs_away(model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float[Tensor, "logs 6"]) -> bool:
+    """Whether a drift carries the bias of a log further than a new turn-on does, in an hour at rest or of its motion.
+
+    The logs are minutes long, and a field that is right for minutes may be wrong without bound. `rest` are their biases.
+    """
+    columns = COLUMNS[sensor]
+    for log, bias in enumerate(rest):
+        rows = pool.log == log
+        t, gyro, accel = pool.t[rows] - pool.t[rows][0], pool.gyro[rows], pool.accel[rows]
+        at_rest = torch.cat([bias[:3], accel.mean(dim=0)]).expand(len(t), 6)
+        for u in (at_rest, torch.cat([gyro, accel], dim=1)):
+            state = bias[None].clone()
+            for _ in range(math.ceil(HOUR_S / float(t[-1]))):
+                path = model.rest_bias(sensor, Segment(t[None], u[None, :, :3], u[None, :, 3:], state))
+                if (path - bias[columns]).abs().max() > TURN_ON_STD[sensor]:
+                    return True
+                state[:, columns] = path[:, -1]
+    return False
 
 
 def _windows(pool: Pool, sensor: Sensor) -> tuple[Int[Tensor, " m"], int]:

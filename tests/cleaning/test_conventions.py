@@ -7,6 +7,7 @@ from itertools import accumulate
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support import drifting
 from support.imu_defects import batch_of
 
 from imutool.cleaning.conventions import Conventions, judge
@@ -160,6 +161,16 @@ def test_a_step_of_one_clock_is_no_delay(share: float, step_s: float, flown: tup
     assert "the clock of the IMU or that of the poses /ground_truth/pose steps by" in found.what
     assert "fix" not in found.values
     assert whole.pose_delay_ns == 0
+
+
+def test_a_part_that_fits_any_delay_shows_no_step() -> None:
+    """The gyro's bias drifts while the body hardly turns: the first eighth fits 70 ms as well as none."""
+    recording = drifting.log(52, drifting.Drifting(kind="warm_up"), 100.0)
+    truth = of_poses("/ground_truth/pose", recording.truth)
+    delay = TopicSummary(CleaningSettings(), len(recording.imu), motion_of(recording.imu), truth).conventions.delay
+    assert delay is not None
+    assert delay.step is None
+    assert abs(delay.seconds) < 0.001
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -26,6 +26,7 @@ from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.training import checkpoint
 from imutool.training.fit import Epoch, Training, TrainSettings
+from imutool.training.held_out import runs_away
 
 Make = Callable[..., Recording]
 TINY = TrainSettings(
@@ -219,6 +220,22 @@ def test_a_descent_that_only_harms_leaves_the_closed_form(recordings: list[Recor
     weights = wild.model.state_dict()
     torch.testing.assert_close(weights["curve.gyro.W"], linear.model.state_dict()["W.gyro"], rtol=0, atol=0)
     assert not weights["curve.gyro.net.4.weight"].any()
+
+
+@pytest.mark.parametrize(("pull", "away"), [(0.0, True), (-50.0, False)])
+def test_a_drift_that_carries_the_bias_away_in_an_hour_is_found(pull: float, away: bool, recordings: list[Recording]) -> None:
+    """1e-5 rad/s² is nothing in a minute, and 0.036 rad/s in an hour; with a pull to a place near the logs it comes to rest."""
+    training = Training(recordings, "neural_ode", TINY)
+    rest = training.tracks.per_log().detach()
+    with torch.no_grad():
+        drift = training.model.get_submodule("drift.gyro")
+        for block in ("block1.4", "block2.2"):
+            for weights in drift.get_submodule(block).parameters():
+                weights.zero_()
+        drift.get_submodule("out").weight[:, :3] = pull * torch.eye(3)  # type: ignore[index]
+        drift.get_submodule("out").bias[:] = 0.1  # type: ignore[index]
+        drift.get_buffer("centre")[:] = rest[:, :3].mean(0)
+    assert runs_away(training.model, "gyro", training.pool, rest) is away
 
 
 def test_a_loss_that_is_no_number_stops_the_training(recordings: list[Recording]) -> None:
