@@ -39,7 +39,7 @@ def read_oxts(
     try:
         t_ns = np.array([stamp.replace(" ", "T") for stamp in stamps], "datetime64[ns]").astype(np.int64)
         values = np.array([row[:23] for row in rows], np.float64)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise DataError(f"holds no numbers ({error})", where=where) from error
     kept = in_order(t_ns, values, times)
     remarks.notes.extend(kept.notes)

@@ -168,7 +168,10 @@ def _exactly(array: Shaped[np.ndarray, "..."], wanted: np.dtype[Any]) -> Shaped[
     """The array in another type; None where this loses something."""
     kind, times = array.dtype.kind, wanted.kind == "i"
     if times and kind == "M":
-        ns = array.astype("datetime64[ns]")
+        try:
+            ns = array.astype("datetime64[ns]")
+        except OverflowError:  # from numpy 2.5 on; before, other numbers stand there
+            return None
         return ns.astype(wanted) if not np.isnat(array).any() and np.array_equal(ns.astype(array.dtype), array) else None
     if array.size and kind in "iu" and kind != wanted.kind:
         most = MOST_EXACT[wanted.kind]
