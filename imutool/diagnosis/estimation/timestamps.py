@@ -146,12 +146,12 @@ def grid(x: Float64[np.ndarray, " n"], settings: TimestampSettings = DEFAULT.tim
 
 def limits(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAULT.timestamps) -> dict[Sensor, float]:
     """Limits of the converters: the largest readings of a side that recur to the last digit."""
-    highest: dict[Sensor, float] = {}
+    highest, moves = dict[Sensor, float](), ~stuck(real)  # a dead axis has no limit
     for k, signal in enumerate(SENSORS):
-        values, at, next_to = real[:, 3 * k : 3 * k + 3], 0, 0
-        most = float(np.abs(values).max())
+        values, at, next_to = real[:, 3 * k : 3 * k + 3][:, moves[3 * k : 3 * k + 3]], 0, 0
+        most = float(np.abs(values).max(initial=0.0))
         for side in (values, -values):  # 16 bits end at -32768 and 32767
-            if (end := float(side.max())) >= settings.clipped_share * most:
+            if (end := float(side.max(initial=0.0))) >= settings.clipped_share * most:
                 below = side[side < end * (1.0 - 1e-9)]
                 at, next_to = at + side.size - below.size, next_to + int((below >= below.max(initial=0.0) * (1.0 - 1e-9)).sum())
         if at >= settings.least_at_limit and at > settings.piled_factor * next_to:  # on a grid all come again, less at the ends

@@ -200,6 +200,11 @@ def test_the_limits_of_a_converter_are_not_alike_on_both_sides(sign: float) -> N
     assert found.held_out.rms_after < 0.1 * found.held_out.rms_before
 
 
+def test_a_dead_axis_has_no_limit() -> None:
+    one = planted.pair(planted.rich())
+    assert timestamps.limits(one.real * np.array([0, 0, 0, 1, 1, 1])) == {}
+
+
 def test_the_same_reading_again_and_again_is_no_limit_where_no_more_was_expected() -> None:
     """A parked vehicle on a coarse grid reads its largest value often, and nothing says that it should read more."""
     t = planted.clock()
