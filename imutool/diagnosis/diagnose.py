@@ -138,7 +138,7 @@ def _beside_reference(
     pairs, left_out = align_all(recordings, simulated, truth, settings)
     if not pairs:
         return check_without_reference(recordings[0], str(reals[0]), left_out[0], settings), None
-    pairs, conventions = (pairs, list[Finding]()) if simulated is None else with_common_conventions(pairs)
+    pairs, conventions = with_common_conventions(pairs, "poses" if simulated is None else "simulation")
     report(1, 4, "noise")
     candidates = candidates_for(pairs)
     logs = [whitened(pair, (*for_noise(candidates), *unnamed.driven([pair])), settings.band) for pair in pairs]

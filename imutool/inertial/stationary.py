@@ -36,6 +36,7 @@ NOISE_BLOCK, CALMEST = 20, 0.25
 CALM = 1.2  # times `white_noise`, that pure white noise is
 MEANS, LEAST_MEANS = (20, 200), 8  # samples of a mean of noise, and how many means there are at least
 TOLERATED_MEAN = 1.8  # by which they may scatter more than noise is measured, which finds five sixths of it
+MOST_DRIFT = np.array([0.1] * 3 + [0.5] * 3)  # rad/s, m/s²: plausible sizes of a bias and of its drift
 KEPT_MEANS = 100  # of windows at rest, for their median
 GAP_PERIODS = 3.0  # a longer step between samples breaks a window
 
@@ -238,6 +239,13 @@ def nothing_but_noise(x: Float64[np.ndarray, " n"], least: float = 0.0) -> bool:
     sizes = [size for size in (*MEANS, len(x) // LEAST_MEANS) if 0 < size <= len(x) // LEAST_MEANS]
     means = (x[: len(x) // size * size].reshape(-1, size).mean(axis=1) for size in sizes)
     return all(float(mean.std()) <= TOLERATED_MEAN * noise / np.sqrt(size) for mean, size in zip(means, sizes, strict=True))
+
+
+def may_rest(imu: Imu) -> bool:
+    """Whether a sensor may rest with biases that drift: means of half a second hardly change."""
+    samples, count = np.concatenate([imu.gyro, imu.accel], axis=1), min(len(imu), round(0.5 / imu.period_s) + 1)
+    means = samples[: len(samples) // count * count].reshape(-1, count, 6).mean(axis=1)
+    return bool((np.abs(means - np.median(means, axis=0)) < MOST_DRIFT).all())
 
 
 def is_white(

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
-from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Bool, Float64
 from imutool.cleaning.stamp_line import unrounded
@@ -20,13 +19,14 @@ from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair, split
 from imutool.diagnosis.estimation.timestamps import without_jitter
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError
+from imutool.geometry import quaternion
 from imutool.inertial.correlation import cross_correlation
-from imutool.inertial.kinematics import G_W, Motion, fit_trajectory, gravity_error
+from imutool.inertial.kinematics import G_W, fit_trajectory, gravity_error
 from imutool.inertial.resampling import refined, refinement
-from imutool.inertial.stationary import is_white, nothing_but_noise, white_noise
+from imutool.inertial.stationary import is_white, may_rest, nothing_but_noise, white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.inertial.wiener import NoiseLeft, denoised, recorded_at
-from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
+from imutool.recording import Imu, Recording, Times, nanoseconds, seconds
 from imutool.sensor.channels import channels_at
 from imutool.sensor.samples import IdealMotion
 
@@ -169,7 +169,8 @@ def _simulated(
     """Simulated motion without noise on an even clock, the noise that was filtered out, and what is left of it."""
     samples = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1)
     noise = white_noise(samples)
-    t_sim = without_jitter(t_sim, samples, settings.timestamps)
+    shared = np.isin(sim.imu.t_ns, real.imu.t_ns).mean() > KNOWN_SHARE  # what jitters in both logs alike sets neither apart
+    t_sim = t_sim if shared else without_jitter(t_sim, samples, settings.timestamps)
     period_s = float(np.median(np.diff(t_sim)))
     of_real = white_noise(np.concatenate([real.imu.gyro, real.imu.accel], axis=1)), len(real.imu)
     ideal = _by_poses(sim, samples, noise, 1.0 / period_s, of_real, settings)
@@ -215,7 +216,7 @@ def _by_poses(
     trajectory = fit_trajectory(poses)  # a simulation's poses are exact, or the test below fails
     there = trajectory.at(t_ns[rows])
     residual = samples[rows] - np.concatenate([there.omega_b, there.specific_force()], axis=1)
-    R_wb = rotation_matrices(there)
+    R_wb = quaternion.matrix(there.q_wb_wxyz)
     off = gravity_error(R_wb, residual[:, 3:], settings.search.observable_squares)
     residual[:, 3:] -= np.einsum("nji,j->ni", R_wb, off)
     if not is_white(residual - residual.mean(axis=0), noise, LEAST_NOISE, own.coarse_bands, own.coarse_factor, own.line_chance):
@@ -224,7 +225,8 @@ def _by_poses(
     t_ns = poses.t_ns[0] + np.arange(int(poses.duration_s * rate_hz) + 1) * round(1e9 / rate_hz)
     motion = trajectory.at(t_ns[t_ns <= poses.t_ns[-1]])
     t_s = np.arange(len(motion.p_wb)) * round(1e9 / rate_hz) * 1e-9
-    return IdealMotion(t_s, motion.omega_b, motion.specific_force(g_w=G_W - off), motion.alpha_b, rotation_matrices(motion))
+    R_wb, force = quaternion.matrix(motion.q_wb_wxyz), motion.specific_force(g_w=G_W - off)
+    return IdealMotion(t_s, motion.omega_b, force, motion.alpha_b, R_wb)
 
 
 def _shared_motion(
@@ -237,25 +239,21 @@ def _shared_motion(
     return replace(ideal, gyro=clean[:, :3], accel=clean[:, 3:], alpha=alpha), left
 
 
-def rotation_matrices(poses: Poses | Motion) -> Float64[np.ndarray, "n 3 3"]:
-    """R_wb of some poses."""
-    return np.asarray(Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix())
-
-
 def _attitude(recording: Recording, t_ns: np.ndarray) -> Float64[np.ndarray, "n 3 3"] | None:
     if not recording.truths:
         return None
     poses, known = recording.truth.at(t_ns, max_gap_s=1.0)
-    return rotation_matrices(poses) if known.mean() > 0.9 else None
+    return quaternion.matrix(poses.q_wb_wxyz) if known.mean() > 0.9 else None
 
 
 def _shift(real: Imu, sim: Imu, settings: AlignmentSettings) -> float | None:
     """Clock shift (s) to add to the recording's times; 0 where a clock offset explains it, None for two motions."""
     overlap = (min(real.t_ns[-1], sim.t_ns[-1]) - max(real.t_ns[0], sim.t_ns[0])) * 1e-9
     shared = overlap > min(settings.least_s, 0.5 * min(real.duration_s, sim.duration_s))
-    if _rests(real) and _rests(sim):
-        return 0.0 if shared else None
-    turns, hz = [_turning(imu, settings.align_hz) for imu in (real, sim)], settings.align_hz
+    if _rests(sim) and (_rests(real) or may_rest(real)):
+        return 0.0 if shared else (int(sim.t_ns[0]) - int(real.t_ns[0])) * 1e-9
+    dead, hz = not np.ptp(real.gyro, axis=0).any(), settings.align_hz  # then the accelerometer shows the motion
+    turns = [_turning(imu.t_ns, imu.accel if dead else imu.gyro, hz) for imu in (real, sim)]
     found = cross_correlation(turns[0], turns[1], round(min(settings.least_s * hz, 0.8 * min(map(len, turns)))))
     lag_s = (int(sim.t_ns[0]) - int(real.t_ns[0])) * 1e-9 + found.lag / hz
     within = (found.best(np.abs(lag_s) < most_s) for most_s in (settings.farthest_s, settings.offset_s, np.inf))
@@ -264,7 +262,8 @@ def _shift(real: Imu, sim: Imu, settings: AlignmentSettings) -> float | None:
         return 0.0
     if sigma < settings.alike_sigma[1] or alike < settings.least_correlation:
         return None
-    return _refined(real, sim, float(lag_s[found.lag == lag][0]), settings)
+    at_s = float(lag_s[found.lag == lag][0])
+    return at_s if dead else _refined(real, sim, at_s, settings)
 
 
 def _rests(imu: Imu) -> bool:
@@ -290,7 +289,7 @@ def _refined(real: Imu, sim: Imu, lag_s: float, settings: AlignmentSettings) -> 
     return lag_s + off_s
 
 
-def _turning(imu: Imu, rate_hz: float) -> Float64[np.ndarray, " m"]:
-    """Size of the angular rate on an even clock."""
-    size = np.linalg.norm(imu.gyro - np.median(imu.gyro, axis=0), axis=1)
-    return np.asarray(np.interp(np.arange(0.0, imu.duration_s, 1.0 / rate_hz), seconds(imu.t_ns, int(imu.t_ns[0])), size))
+def _turning(t_ns: Times, x: Float64[np.ndarray, "n 3"], rate_hz: float) -> Float64[np.ndarray, " m"]:
+    """Size of the angular rate, or of another vector, on an even clock."""
+    size, t_s = np.linalg.norm(x - np.median(x, axis=0), axis=1), seconds(t_ns, int(t_ns[0]))
+    return np.asarray(np.interp(np.arange(0.0, t_s[-1], 1.0 / rate_hz), t_s, size))

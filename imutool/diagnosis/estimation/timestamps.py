@@ -145,16 +145,16 @@ def grid(x: Float64[np.ndarray, " n"], settings: TimestampSettings = DEFAULT.tim
 
 
 def limits(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAULT.timestamps) -> dict[Sensor, float]:
-    """Limits of the converters: the largest readings that recur to the last digit."""
-    highest: dict[Sensor, float] = {}
+    """Limits of the converters: the largest readings of a side that recur to the last digit."""
+    highest, moves = dict[Sensor, float](), ~stuck(real)  # a dead axis has no limit
     for k, signal in enumerate(SENSORS):
-        values = np.abs(real[:, 3 * k : 3 * k + 3])
-        most = float(values.max())
-        below = values[values < most * (1.0 - 1e-9)]
-        at, next_to = values.size - below.size, int((below >= below.max(initial=0.0) * (1.0 - 1e-9)).sum())
-        if (
-            at >= settings.least_at_limit and at > settings.piled_factor * next_to
-        ):  # values on a grid come again everywhere, and less at their ends
+        values, at, next_to = real[:, 3 * k : 3 * k + 3][:, moves[3 * k : 3 * k + 3]], 0, 0
+        most = float(np.abs(values).max(initial=0.0))
+        for side in (values, -values):  # 16 bits end at -32768 and 32767
+            if (end := float(side.max(initial=0.0))) >= settings.clipped_share * most:
+                below = side[side < end * (1.0 - 1e-9)]
+                at, next_to = at + side.size - below.size, next_to + int((below >= below.max(initial=0.0) * (1.0 - 1e-9)).sum())
+        if at >= settings.least_at_limit and at > settings.piled_factor * next_to:  # on a grid all come again, less at the ends
             highest[signal] = most
     return highest
 
@@ -215,7 +215,7 @@ def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "_ 6
         if most is None:
             continue
         part = slice(3 * k, 3 * k + 3)
-        at = np.abs(real[:, part]) >= most * (1.0 - 1e-9)
+        at = np.abs(real[:, part]) >= most * (1.0 - settings.limit_error)
         beyond = (model[:, part] * np.sign(real[:, part]))[at] > most
         chance = float(binom.sf(beyond.sum() - 1, len(beyond), 0.5)) * tried
         if chance > 1e-2 and beyond.mean() < 0.9:

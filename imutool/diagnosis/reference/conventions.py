@@ -1,4 +1,4 @@
-"""Units and axes in which a recording and a simulation of its motion differ.
+"""Units and axes in which a recording and its reference, a simulation or true poses, differ.
 
 A unit or an order of axes is a convention, not physics: no effect of the catalogue is as large, and each would stand for it
 badly (an accelerometer in g looks like a gravity that is too small). So both are looked for first, as `imutool audit` does.
@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from imutool.array_types import Float64
+from imutool.cleaning.rules.axes import TO_Z_UP
 from imutool.diagnosis.audit.axes import Hypotheses, Matrix
 from imutool.diagnosis.audit.motion import OTHER_UNIT
 from imutool.diagnosis.estimation.aligned_log import Pair
@@ -25,8 +26,8 @@ CONSTANT = 0.1  # of the squares of the specific force: a bias and a tilt leave 
 Readings = Float64[np.ndarray, "n 3"]
 
 
-def with_common_conventions(pairs: Sequence[Pair]) -> tuple[list[Pair], list[Finding]]:
-    """Recordings in the units and axes of the simulation, and findings of those that differ."""
+def with_common_conventions(pairs: Sequence[Pair], of: str = "simulation") -> tuple[list[Pair], list[Finding]]:
+    """Recordings in the units and axes of their reference (`of`), and findings of those that differ."""
     changes: dict[Sensor, tuple[float, Matrix]] = {}
     for k, sensor in enumerate(SENSORS):
         part = slice(3 * k, 3 * k + 3)
@@ -37,9 +38,18 @@ def with_common_conventions(pairs: Sequence[Pair]) -> tuple[list[Pair], list[Fin
         )
         changes[sensor] = _convention(sensor, y, x)
     if all(factor == 1.0 and np.array_equal(P, np.eye(3)) for factor, P in changes.values()):
-        return list(pairs), []
-    after = [_converted(pair, changes) for pair in pairs]
-    return after, _findings(pairs, after, changes)
+        return [*map(_with_z_up, pairs)], []
+    after = [_with_z_up(_converted(pair, changes)) for pair in pairs]
+    return after, _findings(pairs, after, changes, of)
+
+
+def _with_z_up(pair: Pair) -> Pair:
+    """Pair in a world whose z is up, if both logs read gravity along -z: its change would have the other sign."""
+    read, R_wb = pair.ideal.sample(pair.stamp_s, pair.stamp_s), pair.ideal.R_wb
+    if R_wb is None or read.at.R_wb is None:
+        return pair
+    up = [float((read.at.R_wb[:, 2] * force).sum()) for force in (read.accel, pair.real[:, 3:])]
+    return replace(pair, ideal=replace(pair.ideal, R_wb=TO_Z_UP["-z"] @ R_wb)) if max(up) < 0.0 else pair
 
 
 def _convention(sensor: Sensor, y: Readings, x: Readings) -> tuple[float, Matrix]:
@@ -73,12 +83,14 @@ def _converted(pair: Pair, changes: dict[Sensor, tuple[float, Matrix]]) -> Pair:
     return replace(pair, real=np.asfortranarray(pair.real @ turn), known=known)
 
 
-def _findings(before: Sequence[Pair], after: Sequence[Pair], changes: dict[Sensor, tuple[float, Matrix]]) -> list[Finding]:
+def _findings(
+    before: Sequence[Pair], after: Sequence[Pair], changes: dict[Sensor, tuple[float, Matrix]], of: str
+) -> list[Finding]:
     found = []
     for sensor, (factor, _) in changes.items():
         if factor != 1.0:
             scale = {"scale": Estimate(1.0 / factor, 0.0, "-")}
-            text = f"{sensor} = {1.0 / factor:.6g} {sensor} of the simulation"
+            text = f"{sensor} = {1.0 / factor:.6g} {sensor} of the {of}"
             found.append(_finding("wrong_unit", sensor, sensor, scale, text, before, after))
     turned = {sensor: P for sensor, (_, P) in changes.items() if not np.array_equal(P, np.eye(3))}
     alike = len({P.tobytes() for P in turned.values()}) == 1 and len(turned) == len(SENSORS)
@@ -86,7 +98,7 @@ def _findings(before: Sequence[Pair], after: Sequence[Pair], changes: dict[Senso
         if not alike or sensor == SENSORS[0]:
             name = "left_handed" if np.linalg.det(P) < 0.0 else "permuted_axes"
             axes = ", ".join(("-" if row.sum() < 0.0 else "") + AXES[int(np.abs(row).argmax())] for row in P)
-            text = f"recorded x, y, z = {axes} of the simulation"
+            text = f"recorded x, y, z = {axes} of the {of}"
             found.append(_finding(name, "both" if alike else sensor, sensor, {}, text, before, after))
     return found
 

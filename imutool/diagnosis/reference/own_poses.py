@@ -17,13 +17,17 @@ from scipy.fft import dct, idct
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
+from imutool.cleaning.rules.axes import TO_Z_UP
+from imutool.cleaning.truth import truth_of
 from imutool.diagnosis.audit.spectral_lines import by_differences
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.time_alignment import with_truth
 from imutool.diagnosis.settings import DiagnoseSettings, ReferenceSettings
 from imutool.errors import DataError
-from imutool.recording import Recording
+from imutool.geometry import quaternion
+from imutool.log_info.imu_motion import motion_of
+from imutool.recording import Poses, Recording
 from imutool.sensor.effects.vibration import is_motion
 from imutool.sensor.samples import IdealMotion
 from imutool.sensor.trajectory import SmoothMotion, Stretch, smooth_motion
@@ -37,6 +41,7 @@ def align_with_poses(real: Recording, settings: DiagnoseSettings) -> Iterator[Pa
     Raises:
         DataError: no stretch is long enough, or the poses cannot be differentiated.
     """
+    real = _with_z_up(real)
     motion = smooth_motion(real.truth)
     pairs = list(_pairs(real, motion, settings))
     if motion.glitches:
@@ -50,6 +55,18 @@ def align_with_poses(real: Recording, settings: DiagnoseSettings) -> Iterator[Pa
             fix="Give a simulation with `sim`",
         )
     yield from pairs
+
+
+def _with_z_up(real: Recording) -> Recording:
+    """Recording with its true poses in a world whose z is up: along another axis gravity would be a misfit of 2 g."""
+    truth = truth_of(real)
+    up = motion_of(real.imu, truth).summary(truth).conventions.up
+    if up not in TO_Z_UP:
+        return real
+    turn, (topic, poses) = TO_Z_UP[up], next(iter(real.truths.items()))
+    q_wb = quaternion.multiply(quaternion.of_matrix(turn), poses.q_wb_wxyz)
+    turned = Poses(poses.t_ns, poses.p_wb @ turn.T, q_wb, None if poses.v_w is None else poses.v_w @ turn.T)
+    return replace(real, truths={**real.truths, topic: turned})
 
 
 def band_hz(stretch: Stretch, settings: ReferenceSettings) -> float:

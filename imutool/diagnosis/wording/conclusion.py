@@ -202,7 +202,7 @@ def _all_findings(d: Diagnosis) -> str:
         if signal in touched and closer.share is not None and closer.share > 0.0
     ]
     of_convention = any(finding.effect in CONVENTIONS for finding in d.findings)
-    who = "in the units and axes of the simulation the others remove" if of_convention else "together they remove"
+    who = f"in the units and axes of {other} the others remove" if of_convention else "together they remove"
     return f"{text}; {who} {' and '.join(gains)}" if gains else text
 
 

@@ -236,6 +236,34 @@ def test_clocks_of_one_epoch_are_left_alone_so_that_an_offset_between_them_shows
     assert later.aligned_s == 0.0
 
 
+def test_jitter_that_both_logs_have_sets_neither_apart() -> None:
+    """A recording with an effect added to it, beside the recording itself: its clock was corrected in one of the two."""
+    real, _ = logs()
+    t_ns = real.imu.t_ns + np.round(np.random.default_rng(1).normal(0.0, 3e5, len(real.imu))).astype(np.int64)
+    jittery = replace(real, imu=replace(real.imu, t_ns=t_ns))
+    (pair,) = with_simulation(jittery, jittery)
+    assert (left(pair)[:, :3].std(axis=0) < 0.2 * planted.NOISE[:3]).all()
+
+
+@pytest.mark.parametrize("away_ns", [0, YEAR_NS])
+def test_at_rest_a_bias_that_drifts_is_no_motion(away_ns: int) -> None:
+    t_s = planted.clock()
+    rest, warm = (
+        np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (len(t_s), 1)),
+        np.outer(1.0 - np.exp(-t_s / 8.0), [0.02, 0, 0, 0, 0.2, 0]),
+    )
+    sim = planted.recording("sim", t_s, rest, planted.START_NS + away_ns)
+    (pair,) = with_simulation(planted.recording("real", t_s, rest + warm + planted.noise(len(t_s), 2)), sim)
+    assert pair.aligned_s == pytest.approx(away_ns * 1e-9)
+    assert not same_motion(planted.recording("real", t_s, rest + 10.0 * warm).imu, sim.imu)
+
+
+def test_beside_a_dead_gyro_the_accelerometer_shows_the_motion() -> None:
+    real, sim = logs(sim_start_ns=planted.START_NS + YEAR_NS)
+    (pair,) = with_simulation(replace(real, imu=replace(real.imu, gyro=np.zeros_like(real.imu.gyro))), sim)
+    assert pair.aligned_s - YEAR_NS * 1e-9 == pytest.approx(0.0, abs=GRID_S)
+
+
 @pytest.mark.parametrize("away_ns", [YEAR_NS, -YEAR_NS, 3_600_000_000_000, 700_000_000, -1_500_000_000, 4_900_000_000])
 def test_clocks_without_a_common_epoch_are_aligned_by_the_motion(away_ns: int) -> None:
     (pair,) = with_simulation(*logs(sim_start_ns=planted.START_NS + away_ns))

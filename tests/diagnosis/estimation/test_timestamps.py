@@ -189,6 +189,22 @@ def test_the_limit_is_found_exactly_and_clipped_rows_are_those_at_it(quantile: f
     assert found.share == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_the_limits_of_a_converter_are_not_alike_on_both_sides(sign: float) -> None:
+    one = planted.pair(planted.rich())
+    lsb = float(np.quantile(np.abs(one.real[:, :3]), 0.9)) / 32768
+    digits = sign * np.clip(np.round(sign * one.real[:, :3] / lsb), -32768, 32767)
+    clipped = replace(one, real=np.concatenate([lsb * digits, one.real[:, 3:]], axis=1))
+    assert timestamps.limits(clipped.real) == {"gyro": 32768 * lsb}
+    (found,) = timestamps.saturated([clipped], [one.real], 50)
+    assert found.held_out.rms_after < 0.1 * found.held_out.rms_before
+
+
+def test_a_dead_axis_has_no_limit() -> None:
+    one = planted.pair(planted.rich())
+    assert timestamps.limits(one.real * np.array([0, 0, 0, 1, 1, 1])) == {}
+
+
 def test_the_same_reading_again_and_again_is_no_limit_where_no_more_was_expected() -> None:
     """A parked vehicle on a coarse grid reads its largest value often, and nothing says that it should read more."""
     t = planted.clock()

@@ -65,6 +65,16 @@ def test_axes_that_the_motion_does_not_tell_apart_stay() -> None:
     assert with_common_conventions([replace(flat, real=swapped)])[1] == []
 
 
+@pytest.mark.parametrize("z", [1.0, -1.0])
+def test_gravity_is_up_in_the_world_of_both_logs(z: float) -> None:
+    """In a world whose z is down, as a simulator in NED has it, more gravity was less of it."""
+    felt, turn = planted.rich(2, SECONDS), np.diag([1.0, z, z])
+    columns = {name: np.ascontiguousarray(getattr(felt, name) @ turn) for name in ("gyro", "accel", "alpha")}
+    (pair,), _ = with_common_conventions([planted.pair(replace(felt, R_wb=turn @ felt.R_wb @ turn, **columns))])
+    assert pair.ideal.R_wb is not None
+    assert np.einsum("nij,nj->ni", pair.ideal.R_wb, pair.ideal.accel)[:, 2].mean() > 9.0
+
+
 def test_the_conclusion_does_not_count_a_convention_among_what_the_others_remove(pair) -> None:
     read = np.concatenate([pair.real[:, :3] @ SWAPPED.T, pair.real[:, 3:] @ SWAPPED.T], axis=1)
     _, (axes,) = with_common_conventions([replace(pair, real=read)])

@@ -11,8 +11,10 @@ import pytest
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
+from imutool.cleaning.rules.axes import TO_Z_UP
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.reference.conventions import with_common_conventions
 from imutool.diagnosis.reference.coverage import align, align_all
 from imutool.diagnosis.reference.taken_samples import batched, filled, new_samples, repeats
 from imutool.diagnosis.settings import DiagnoseSettings
@@ -161,6 +163,29 @@ def test_a_simulation_that_holds_its_samples_is_read_where_its_physics_steps() -
     assert f"{np.count_nonzero(last != np.arange(len(last)))} samples repeat gyro or accel of the one before" in remarks[0]
     left, least = ((one.real - expected(one, ()))[100:-100].std(axis=0) for one in (pair, whole))
     assert (left < HELD_LEAVES * least).all()
+
+
+@pytest.mark.parametrize("turn", TO_Z_UP.values())
+def test_poses_of_a_world_with_another_axis_up_are_turned(turn: np.ndarray) -> None:
+    real = made(EXACT)
+    real, poses, other = replace(real, imu=along(real, 1).imu), real.truth, Rotation.from_matrix(turn.T)
+    q_wb = (other * Rotation.from_quat(poses.q_wb_wxyz.copy(), scalar_first=True)).as_quat(scalar_first=True)
+    turned = replace(real, truths={TRUTH_TOPIC: Poses(poses.t_ns, poses.p_wb @ turn, q_wb)})
+    ((pair,), _), ((same,), _) = (align_all([one], None, None, DiagnoseSettings()) for one in (turned, real))
+    assert np.abs(expected(pair, ()) - expected(same, ())).max() < 0.01
+
+
+def test_units_are_told_beside_the_poses_of_the_recording_too() -> None:
+    real = made(EXACT)
+    imu = along(real, 1).imu
+    other = replace(real, imu=replace(imu, gyro=np.degrees(imu.gyro), accel=imu.accel / 9.80665))
+    pairs, _ = align_all([other], None, None, DiagnoseSettings())
+    (after,), found = with_common_conventions(pairs, "poses")
+    assert [(one.effect, one.equation) for one in found] == [
+        ("wrong_unit", "gyro = 57.2958 gyro of the poses"),
+        ("wrong_unit", "accel = 0.101972 accel of the poses"),
+    ]
+    assert np.abs(after.real - expected(after, ())).max() < 1.0
 
 
 @pytest.mark.parametrize("with_simulation", [True, False])
