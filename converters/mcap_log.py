@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from itertools import chain, pairwise
@@ -19,13 +19,11 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._mcap_chunks import RECORD_HEAD, beside_messages, in_order, summary_of
+from ._mcap_chunks import MAGIC, RECORD_HEAD, Content, in_order, summary_of
 from ._ros_types import plain_cdr
 from ._source import find_files, find_folders, head, name, with_suffix
 
 GENERAL = True
-MAGIC = b"\x89MCAP0\r\n"
-CRC_AT = 33  # in a Chunk record: behind opcode, length, two times and the size
 IMUS = r"sensor_msgs/msg/Imu|px4_msgs/msg/(Sensor|Vehicle).*"  # PX4 has parts of an IMU in messages of their own
 METADATA = "metadata.yaml"  # of a ROS 2 bag, which its recorder writes last
 PART = r"(.*)_(\d+)"  # name of a part of a ROS 2 bag
@@ -68,7 +66,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     with _refusing(sequence.path), sequence.path.open("rb") as file:
         reader = _reader(file)
         summary = summary_of(reader, file)
-        metadata, attachments = beside_messages(reader, summary, file)
+        content = Content(summary, file)
         of_channel = summary.statistics.channel_message_counts if summary.statistics is not None else {}
         counts: dict[str, int] = {}
         topics: list[MessageTopic] = []
@@ -79,34 +77,21 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
                     topics.append(_topic(schema, channel))
                 if summary.statistics is not None:
                     counts[channel.topic] = counts.get(channel.topic, 0) + of_channel.get(number, 0)
-        own = {**metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
-        unchecked = _without_crc(file, summary.chunk_indexes)
-    log = MessageLog(
+        own = {**content.metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
+    return MessageLog(
         sequence.name,
         sequence.path.name,
         topics=tuple(topics),
         messages=partial(_messages, sequence.path, images),
         counts=counts,
-        metadata={"imutool": own, **metadata},
+        metadata={"imutool": own, **content.metadata},
+        remarks=Remarks(content.notes, content.losses),
     )
-    if attachments:
-        log.remarks.losses.append(f"attachments are not carried over: {', '.join(attachments)}")
-    log.remarks.notes += [f"{unchecked} chunks state no CRC: their messages are not checked"] if unchecked else []
-    return log
 
 
 def _may_be_imu(schema_name: str, encoding: str) -> bool:
     """Whether messages are an IMU or a part of one: their topics are defined ahead of them, as two may be joined."""
     return encoding == "cdr" and bool(re.fullmatch(IMUS, schema_name))
-
-
-def _without_crc(file: BinaryIO, chunks: Iterable[Any]) -> int:
-    """Number of chunks that state no CRC."""
-    count = 0
-    for chunk in chunks:
-        file.seek(chunk.chunk_start_offset + CRC_AT)
-        count += file.read(4) == bytes(4)
-    return count
 
 
 def read(source: Path) -> Iterator[MessageLog]:
