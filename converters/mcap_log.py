@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from itertools import chain, pairwise
@@ -28,6 +28,7 @@ IMUS = r"sensor_msgs/msg/Imu|px4_msgs/msg/(Sensor|Vehicle).*"  # PX4 has parts o
 METADATA = "metadata.yaml"  # of a ROS 2 bag, which its recorder writes last
 PART = r"(.*)_(\d+)"  # name of a part of a ROS 2 bag
 MOST_PAUSE_NS = 10 * 10**9  # between the parts of one recording, which a recorder splits as it goes
+Define = Callable[[MessageTopic], MessageTopic]
 IMAGES = r"(sensor_msgs/(msg/)?|foxglove\.)(CompressedImage|Image|RawImage)"
 
 
@@ -55,14 +56,21 @@ def recognises(sequence: Sequence) -> bool:
     return True
 
 
-def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
-    """Message log of an MCAP log, or of the parts of one.
+def as_defined(topic: MessageTopic) -> MessageTopic:
+    """The topic with the definition that the log has."""
+    return topic
+
+
+def read_sequence(sequence: Sequence, *, images: bool = True, define: Define = as_defined) -> MessageLog:
+    """Message log of an MCAP log, or of the parts of one; `define` gives topics the definitions that it lacks.
 
     Raises:
         DataError: the log is damaged.
     """
     if sequence.path.is_dir():
-        return _read_parts(sequence, images)
+        paths = _parts(sequence.path)
+        note = f"the bag has no {METADATA}; read in this order: {', '.join(path.name for path in paths)}"
+        return read_parts(sequence, paths, Remarks([note]), images=images, define=define)
     with _refusing(sequence.path), sequence.path.open("rb") as file:
         reader = _reader(file)
         summary = summary_of(reader, file)
@@ -74,7 +82,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
             schema = summary.schemas.get(channel.schema_id)
             if images or not re.fullmatch(IMAGES, schema.name if schema else ""):
                 if schema is not None and _may_be_imu(schema.name, channel.message_encoding):
-                    topics.append(_topic(schema, channel))
+                    topics.append(define(_topic(schema, channel)))
                 if summary.statistics is not None:
                     counts[channel.topic] = counts.get(channel.topic, 0) + of_channel.get(number, 0)
         own = {**content.metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
@@ -82,7 +90,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         sequence.name,
         sequence.path.name,
         topics=tuple(topics),
-        messages=partial(_messages, sequence.path, images),
+        messages=partial(_messages, sequence.path, images, define),
         counts=counts,
         metadata={"imutool": own, **content.metadata},
         remarks=Remarks(content.notes, content.losses),
@@ -146,16 +154,29 @@ def _is_ours(path: Path) -> bool:
     return summary is not None and any(index.name.startswith("imutool") for index in summary.metadata_indexes)
 
 
+def first_ns(path: Path) -> int:
+    """First log time of a finished log; 0 of any other."""
+    return (_span(path) or (0, 0))[0]
+
+
+def is_finished(path: Path) -> bool:
+    """Whether a file is an MCAP log that ends as its writer ends one."""
+    if head(path, len(MAGIC)) != MAGIC:
+        return False
+    with path.open("rb") as file:
+        return _ends_whole(file)
+
+
 def _summary(path: Path) -> Any:
     """Summary of a finished log; None of any other."""
     try:
         with _refusing(path), path.open("rb") as file:
-            return _reader(file).get_summary() if _is_finished(file) else None
+            return _reader(file).get_summary() if _ends_whole(file) else None
     except DataError:  # said again when the log is read
         return None
 
 
-def _is_finished(file: BinaryIO) -> bool:
+def _ends_whole(file: BinaryIO) -> bool:
     """Whether a log ends as its writer ends one."""
     file.seek(-len(MAGIC), 2)
     end = file.read()
@@ -163,18 +184,17 @@ def _is_finished(file: BinaryIO) -> bool:
     return end == MAGIC
 
 
-def _read_parts(sequence: Sequence, images: bool) -> MessageLog:
+def read_parts(
+    sequence: Sequence, paths: list[Path], remarks: Remarks, *, images: bool = True, define: Define = as_defined
+) -> MessageLog:
     """Message log of the parts of a ROS 2 bag, one after the other; an unfinished one is read up to its end."""
-    paths, remarks, counts = _parts(sequence.path), Remarks(), Counter[str]()
+    counts = Counter[str]()
     topics: dict[str, MessageTopic] = {}
     metadata: dict[str, dict[str, str]] = {}
     sources = []
-    remarks.notes.append(f"the bag has no {METADATA}; read in this order: {', '.join(path.name for path in paths)}")
     for path in paths:
-        with path.open("rb") as file:
-            is_finished = _is_finished(file)
-        if is_finished:
-            part = read_sequence(Sequence(path.stem, path), images=images)
+        if is_finished(path):
+            part = read_sequence(Sequence(path.stem, path), images=images, define=define)
             remarks.notes += [note for note in part.remarks.notes if note not in remarks.notes]
             remarks.losses += part.remarks.losses
             counts.update(part.counts)
@@ -243,14 +263,14 @@ def _reader(file: Any) -> Any:
     return make_reader(file, validate_crcs=True)
 
 
-def _messages(path: Path, images: bool) -> Iterator[Message]:
+def _messages(path: Path, images: bool, define: Define = as_defined) -> Iterator[Message]:
     """Messages in log-time order."""
     topics: dict[int, MessageTopic] = {}
     with _refusing(path), path.open("rb") as file:
         for schema, channel, message in in_order(_reader(file), file):
             topic = topics.get(channel.id)
             if topic is None:
-                topic = topics[channel.id] = _topic(schema, channel)
+                topic = topics[channel.id] = define(_topic(schema, channel))
             if images or not re.fullmatch(IMAGES, topic.schema_name):
                 yield message._replace(topic=topic, payload=_plain(topic, message.payload))
 
