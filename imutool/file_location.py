@@ -73,7 +73,7 @@ def to_location(text: str) -> Location:
             `-`, which is elsewhere a stream.
     """
     if text == "-":
-        what = "is a stream: a log is read by its indexes, and checked after it is written"
+        what = "is a stream: a log is read by its indexes, and what is written is complete before it gets its name"
         raise ConfigError(what, where="-", expected="a file or a URL", fix="Name a file; one called - is ./-")
     scheme, colon, rest = text.partition("://")
     if not colon:
