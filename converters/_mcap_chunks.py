@@ -1,16 +1,27 @@
-"""Messages of an MCAP log's chunks in log-time order."""
+"""Messages of an MCAP log in log-time order, and what is beside them.
+
+The data section is followed record by record: an index need not list what is there.
+"""
 
 from __future__ import annotations
 
+import zlib
 from bisect import bisect_left
+from collections import Counter
 from collections.abc import Iterator
 from struct import Struct
 from typing import Any, BinaryIO
 
 from imutool.recording.message_log import Message
 
+MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = 9  # bytes of a record ahead of its content: opcode and length
-RECORD, MESSAGE, MESSAGE_OPCODE = Struct("<BQ"), Struct("<HIQQ"), 5  # a message: channel, sequence, log and publish times
+RECORD, MESSAGE_HEAD = Struct("<BQ"), Struct("<HIQQ")  # a message: channel, sequence, log and publish times
+TIME, CRC_AT = Struct("<Q"), 24  # first in a chunk's content, and where in it its CRC is
+ATTACHMENT_HEAD = Struct("<QQI")  # two times, and bytes of the name
+FOOTER, MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = 2, 5, 6, 9, 12, 15  # opcodes; none is larger
+RUN_BYTES = 1 << 20  # messages outside chunks are read in runs of about this size
+WRITTEN_OVER = ("rosbag2", "imutool")  # metadata whose writers write a newer record behind the one that it replaces
 _Waiting = tuple[int, int, int, int, int, bytes]  # log time, place of its chunk, number in it, channel, publish time, content
 
 
@@ -34,69 +45,146 @@ def summary_of(reader: Any, file: BinaryIO) -> Any:
     return summary
 
 
-def beside_messages(reader: Any, summary: Any, file: BinaryIO) -> tuple[dict[str, dict[str, str]], list[str]]:
-    """Metadata by name and names of attachments, also of those that no index lists."""
-    from mcap.records import Attachment, Metadata
-    from mcap.stream_reader import StreamReader
+class Content:
+    """Content of a log's data section, which need not be in its summary.
 
-    stated, metadata, attachments = summary.statistics, dict[str, dict[str, str]](), list[str]()
-    listed = len(summary.metadata_indexes), len(summary.attachment_indexes)
-    records = reader.iter_metadata()
-    if stated is not None and (stated.metadata_count, stated.attachment_count) == listed:
-        attachments += [index.name for index in summary.attachment_indexes]
-    else:
-        file.seek(0)
-        records = StreamReader(file, emit_chunks=True).records
-    for record in records:
-        if isinstance(record, Metadata):
-            metadata.setdefault(record.name, {}).update(record.metadata)
-        elif isinstance(record, Attachment):
-            attachments.append(record.name)
-    return metadata, attachments
+    Attributes:
+        blocks: first log time, place and bytes of each run of messages outside chunks; of each chunk, with 0 bytes.
+        metadata: metadata by name.
+        losses, notes: what of it a converted log lacks, and what nothing checks.
+
+    Raises:
+        ValueError: a record that crosses the end, or data that have another CRC than is stated.
+    """
+
+    def __init__(self, summary: Any, file: BinaryIO) -> None:
+        self.blocks: list[tuple[int, int, int]] = []
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._file, self._unchecked, self._outside, self._stated = file, 0, 0, 0
+        self._attachments, self._replaced, others = list[str](), list[str](), Counter[int]()
+        take = {
+            CHUNK: self._take_chunk,
+            MESSAGE: self._take_message,
+            METADATA: self._take_metadata,
+            ATTACHMENT: self._take_attachment,
+            DATA_END: self._take_end,
+        }
+        for opcode, at, size in _records(summary, file):
+            if opcode in take:
+                take[opcode](at, size)
+            elif opcode > DATA_END:
+                others[opcode] += 1
+        kinds = ", ".join(f"{count} of 0x{opcode:02x}" for opcode, count in sorted(others.items()))
+        losses = {
+            "attachments are not carried over": ", ".join(self._attachments),
+            "records that are none of MCAP's own are not carried over": kinds,
+            "metadata of one name are joined, and later values replace others": ", ".join(self._replaced),
+        }
+        self.losses = [f"{what}: {which}" for what, which in losses.items() if which]
+        chunks = f"{self._unchecked} chunks state no CRC: their messages are not checked"
+        outside = f"{self._outside} messages lie outside chunks, where no CRC covers them"
+        self.notes = [*[chunks][: self._unchecked], *([outside] if self._outside and not self._stated else [])]
+
+    def _take_chunk(self, at: int, _: int) -> None:
+        (first_ns,) = TIME.unpack(self._file.read(TIME.size))
+        self.blocks.append((first_ns, at, 0))
+        self._file.seek(at + RECORD_HEAD + CRC_AT)
+        self._unchecked += self._file.read(4) == bytes(4)
+
+    def _take_message(self, at: int, size: int) -> None:
+        _, _, log_time, _ = MESSAGE_HEAD.unpack(self._file.read(MESSAGE_HEAD.size))
+        first_ns, begin, run = self.blocks[-1] if self.blocks else (0, 0, 0)
+        if run and begin + run == at and run < RUN_BYTES:
+            self.blocks[-1] = min(first_ns, log_time), begin, run + size
+        else:
+            self.blocks.append((log_time, at, size))
+        self._outside += 1
+
+    def _take_metadata(self, at: int, size: int) -> None:
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Metadata
+
+        record = Metadata.read(ReadDataStream(self._file))
+        known, new = self.metadata.setdefault(record.name, {}), record.metadata
+        if not record.name.startswith(WRITTEN_OVER):
+            self._replaced += [f"{key} of {record.name}" for key in known if new.get(key, known[key]) != known[key]]
+        known.update(new)
+
+    def _take_attachment(self, at: int, size: int) -> None:
+        _, _, length = ATTACHMENT_HEAD.unpack(self._file.read(ATTACHMENT_HEAD.size))
+        self._attachments.append(self._file.read(min(length, size)).decode(errors="replace"))
+
+    def _take_end(self, at: int, size: int) -> None:
+        self._stated = int.from_bytes(self._file.read(4), "little")
+        if self._stated and self._outside and self._stated != _crc(self._file, at):
+            raise ValueError("its data have another CRC than it states")
+
+
+def _records(summary: Any, file: BinaryIO) -> Iterator[tuple[int, int, int]]:
+    """Opcode, place and size of each record of the data section; `file` is at its content."""
+    listed = {index.chunk_start_offset: index.message_index_length for index in summary.chunk_indexes}
+    end = file.seek(0, 2) - len(MAGIC)
+    at, opcode = len(MAGIC), 0
+    while opcode not in (DATA_END, FOOTER):
+        file.seek(at)
+        opcode, length = RECORD.unpack(file.read(RECORD_HEAD))
+        size = RECORD_HEAD + length
+        if not opcode or size > end - at:
+            raise ValueError(f"the record at byte {at} is none, or crosses the end")
+        yield opcode, at, size
+        at += size + (listed.get(at, 0) if opcode == CHUNK else 0)
+
+
+def _crc(file: BinaryIO, end: int) -> int:
+    """CRC of a file up to a byte."""
+    file.seek(0)
+    crc = 0
+    for at in range(0, end, RUN_BYTES):
+        crc = zlib.crc32(file.read(min(RUN_BYTES, end - at)), crc)
+    return crc
 
 
 def in_order(reader: Any, file: BinaryIO) -> Iterator[tuple[Any, Any, Message]]:
-    """Schema, channel and content of each message, as `reader.iter_messages()` yields them.
+    """Schema, channel and content of each message, in order of log time, then of the file.
 
     Chunks are sorted as they come, in place of a heap of single messages.
     """
     from mcap.data_stream import ReadDataStream
     from mcap.records import Chunk
+    from mcap.stream_reader import get_chunk_data_stream
 
-    found = reader.get_summary()
-    if found is None or not found.chunk_indexes:
-        for schema, channel, record in reader.iter_messages():
-            yield schema, channel, Message(channel, record.log_time, record.publish_time, record.data)
-        return
     summary, waiting = summary_of(reader, file), list[_Waiting]()
-    for start_ns, at in sorted((index.message_start_time, index.chunk_start_offset) for index in summary.chunk_indexes):
+    for start_ns, at, size in sorted(Content(summary, file).blocks):
         due = bisect_left(waiting, (start_ns, at))
         yield from (_defined(summary, record) for record in waiting[:due])
         del waiting[:due]
-        file.seek(at + RECORD_HEAD)
-        waiting += _messages_in(Chunk.read(ReadDataStream(file)), at)
+        if size:
+            file.seek(at)
+            data = file.read(size)
+        else:
+            file.seek(at + RECORD_HEAD)
+            stream, unpacked = get_chunk_data_stream(Chunk.read(ReadDataStream(file)), validate_crc=True)
+            data = stream.read(unpacked)
+        waiting += _messages_in(data, at)
         waiting.sort()
     yield from (_defined(summary, record) for record in waiting)
 
 
-def _messages_in(chunk: Any, at: int) -> Iterator[_Waiting]:
-    """Messages of a chunk; the library's own records take three times as long.
+def _messages_in(data: bytes, at: int) -> Iterator[_Waiting]:
+    """Messages of a chunk or a run; the library's own records take three times as long.
 
     Raises:
         ValueError: a record that is longer than its chunk, or shorter than the head of a message.
     """
-    from mcap.stream_reader import get_chunk_data_stream
-
-    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-    data, place, number = stream.read(size), 0, 0
+    place, number, size = 0, 0, len(data)
     while place < size:
         opcode, length = RECORD.unpack_from(data, place)
         place += RECORD_HEAD
-        if length > size - place or (opcode == MESSAGE_OPCODE and length < MESSAGE.size):
+        if length > size - place or (opcode == MESSAGE and length < MESSAGE_HEAD.size):
             raise ValueError(f"a record of {length} bytes in a chunk of {size}")
-        if opcode == MESSAGE_OPCODE:
-            channel, _, log_time, publish_time = MESSAGE.unpack_from(data, place)
-            yield log_time, at, number, channel, publish_time, data[place + MESSAGE.size : place + length]
+        if opcode == MESSAGE:
+            channel, _, log_time, publish_time = MESSAGE_HEAD.unpack_from(data, place)
+            yield log_time, at, number, channel, publish_time, data[place + MESSAGE_HEAD.size : place + length]
             number += 1
         place += length
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from itertools import chain, pairwise
@@ -19,17 +19,16 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._mcap_chunks import RECORD_HEAD, beside_messages, in_order, summary_of
+from ._mcap_chunks import MAGIC, RECORD_HEAD, Content, in_order, summary_of
 from ._ros_types import plain_cdr
 from ._source import find_files, find_folders, head, name, with_suffix
 
 GENERAL = True
-MAGIC = b"\x89MCAP0\r\n"
-CRC_AT = 33  # in a Chunk record: behind opcode, length, two times and the size
 IMUS = r"sensor_msgs/msg/Imu|px4_msgs/msg/(Sensor|Vehicle).*"  # PX4 has parts of an IMU in messages of their own
 METADATA = "metadata.yaml"  # of a ROS 2 bag, which its recorder writes last
 PART = r"(.*)_(\d+)"  # name of a part of a ROS 2 bag
 MOST_PAUSE_NS = 10 * 10**9  # between the parts of one recording, which a recorder splits as it goes
+Define = Callable[[MessageTopic], MessageTopic]
 IMAGES = r"(sensor_msgs/(msg/)?|foxglove\.)(CompressedImage|Image|RawImage)"
 
 
@@ -57,18 +56,25 @@ def recognises(sequence: Sequence) -> bool:
     return True
 
 
-def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
-    """Message log of an MCAP log, or of the parts of one.
+def as_defined(topic: MessageTopic) -> MessageTopic:
+    """The topic with the definition that the log has."""
+    return topic
+
+
+def read_sequence(sequence: Sequence, *, images: bool = True, define: Define = as_defined) -> MessageLog:
+    """Message log of an MCAP log, or of the parts of one; `define` gives topics the definitions that it lacks.
 
     Raises:
         DataError: the log is damaged.
     """
     if sequence.path.is_dir():
-        return _read_parts(sequence, images)
+        paths = _parts(sequence.path)
+        note = f"the bag has no {METADATA}; read in this order: {', '.join(path.name for path in paths)}"
+        return read_parts(sequence, paths, Remarks([note]), images=images, define=define)
     with _refusing(sequence.path), sequence.path.open("rb") as file:
         reader = _reader(file)
         summary = summary_of(reader, file)
-        metadata, attachments = beside_messages(reader, summary, file)
+        content = Content(summary, file)
         of_channel = summary.statistics.channel_message_counts if summary.statistics is not None else {}
         counts: dict[str, int] = {}
         topics: list[MessageTopic] = []
@@ -76,37 +82,24 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
             schema = summary.schemas.get(channel.schema_id)
             if images or not re.fullmatch(IMAGES, schema.name if schema else ""):
                 if schema is not None and _may_be_imu(schema.name, channel.message_encoding):
-                    topics.append(_topic(schema, channel))
+                    topics.append(define(_topic(schema, channel)))
                 if summary.statistics is not None:
                     counts[channel.topic] = counts.get(channel.topic, 0) + of_channel.get(number, 0)
-        own = {**metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
-        unchecked = _without_crc(file, summary.chunk_indexes)
-    log = MessageLog(
+        own = {**content.metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
+    return MessageLog(
         sequence.name,
         sequence.path.name,
         topics=tuple(topics),
-        messages=partial(_messages, sequence.path, images),
+        messages=partial(_messages, sequence.path, images, define),
         counts=counts,
-        metadata={"imutool": own, **metadata},
+        metadata={"imutool": own, **content.metadata},
+        remarks=Remarks(content.notes, content.losses),
     )
-    if attachments:
-        log.remarks.losses.append(f"attachments are not carried over: {', '.join(attachments)}")
-    log.remarks.notes += [f"{unchecked} chunks state no CRC: their messages are not checked"] if unchecked else []
-    return log
 
 
 def _may_be_imu(schema_name: str, encoding: str) -> bool:
     """Whether messages are an IMU or a part of one: their topics are defined ahead of them, as two may be joined."""
     return encoding == "cdr" and bool(re.fullmatch(IMUS, schema_name))
-
-
-def _without_crc(file: BinaryIO, chunks: Iterable[Any]) -> int:
-    """Number of chunks that state no CRC."""
-    count = 0
-    for chunk in chunks:
-        file.seek(chunk.chunk_start_offset + CRC_AT)
-        count += file.read(4) == bytes(4)
-    return count
 
 
 def read(source: Path) -> Iterator[MessageLog]:
@@ -161,16 +154,29 @@ def _is_ours(path: Path) -> bool:
     return summary is not None and any(index.name.startswith("imutool") for index in summary.metadata_indexes)
 
 
+def first_ns(path: Path) -> int:
+    """First log time of a finished log; 0 of any other."""
+    return (_span(path) or (0, 0))[0]
+
+
+def is_finished(path: Path) -> bool:
+    """Whether a file is an MCAP log that ends as its writer ends one."""
+    if head(path, len(MAGIC)) != MAGIC:
+        return False
+    with path.open("rb") as file:
+        return _ends_whole(file)
+
+
 def _summary(path: Path) -> Any:
     """Summary of a finished log; None of any other."""
     try:
         with _refusing(path), path.open("rb") as file:
-            return _reader(file).get_summary() if _is_finished(file) else None
+            return _reader(file).get_summary() if _ends_whole(file) else None
     except DataError:  # said again when the log is read
         return None
 
 
-def _is_finished(file: BinaryIO) -> bool:
+def _ends_whole(file: BinaryIO) -> bool:
     """Whether a log ends as its writer ends one."""
     file.seek(-len(MAGIC), 2)
     end = file.read()
@@ -178,18 +184,17 @@ def _is_finished(file: BinaryIO) -> bool:
     return end == MAGIC
 
 
-def _read_parts(sequence: Sequence, images: bool) -> MessageLog:
+def read_parts(
+    sequence: Sequence, paths: list[Path], remarks: Remarks, *, images: bool = True, define: Define = as_defined
+) -> MessageLog:
     """Message log of the parts of a ROS 2 bag, one after the other; an unfinished one is read up to its end."""
-    paths, remarks, counts = _parts(sequence.path), Remarks(), Counter[str]()
+    counts = Counter[str]()
     topics: dict[str, MessageTopic] = {}
     metadata: dict[str, dict[str, str]] = {}
     sources = []
-    remarks.notes.append(f"the bag has no {METADATA}; read in this order: {', '.join(path.name for path in paths)}")
     for path in paths:
-        with path.open("rb") as file:
-            is_finished = _is_finished(file)
-        if is_finished:
-            part = read_sequence(Sequence(path.stem, path), images=images)
+        if is_finished(path):
+            part = read_sequence(Sequence(path.stem, path), images=images, define=define)
             remarks.notes += [note for note in part.remarks.notes if note not in remarks.notes]
             remarks.losses += part.remarks.losses
             counts.update(part.counts)
@@ -258,14 +263,14 @@ def _reader(file: Any) -> Any:
     return make_reader(file, validate_crcs=True)
 
 
-def _messages(path: Path, images: bool) -> Iterator[Message]:
+def _messages(path: Path, images: bool, define: Define = as_defined) -> Iterator[Message]:
     """Messages in log-time order."""
     topics: dict[int, MessageTopic] = {}
     with _refusing(path), path.open("rb") as file:
         for schema, channel, message in in_order(_reader(file), file):
             topic = topics.get(channel.id)
             if topic is None:
-                topic = topics[channel.id] = _topic(schema, channel)
+                topic = topics[channel.id] = define(_topic(schema, channel))
             if images or not re.fullmatch(IMAGES, topic.schema_name):
                 yield message._replace(topic=topic, payload=_plain(topic, message.payload))
 

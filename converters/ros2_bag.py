@@ -13,14 +13,15 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path, PurePath
 from typing import Any
 
 from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
-from . import Sequence
+from . import Sequence, mcap_log
 from ._ros_types import definition_from_files, need_rosbags, plain_cdr, ros2_definition
 from ._source import find_files, find_folders, head, with_suffix
 
@@ -56,6 +57,8 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     """
     need_rosbags(sequence.path)
     remarks = Remarks()
+    if files := _mcap_files(sequence.path):  # rosbags gives no publish times, and no messages that are not CDR
+        return _of_mcap(sequence, files, remarks, images)
     with _open(sequence.path, remarks) as readers:
         topics: dict[str, MessageTopic] = {}
         counts = Counter[str]()
@@ -73,6 +76,35 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         metadata={"imutool": {"format": "ros2_bag", "sequence": sequence.name}},
         remarks=remarks,
     )
+
+
+def _mcap_files(path: Path) -> list[Path]:
+    """Storage files of a bag with metadata.yaml, in order, where all are finished MCAP logs."""
+    if not (path.is_dir() and _has_metadata(path)):
+        return []
+    files = [path / name for name in _named(path)]
+    if not all(file.is_file() for file in files):
+        files = sorted(with_suffix(path, ".mcap"), key=mcap_log.first_ns)
+    return files if all(mcap_log.is_finished(file) for file in files) else []
+
+
+def _of_mcap(sequence: Sequence, files: list[Path], remarks: Remarks, images: bool) -> MessageLog:
+    """Message log of the MCAP files of a bag; of a topic it counts what metadata.yaml does, if that is more."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    _misleads(sequence.path, remarks)
+    define = cache(partial(_with_definition, path=sequence.path, remarks=remarks))
+    log = mcap_log.read_parts(sequence, files, remarks, images=images, define=define)
+    try:
+        about = YAML(typ="safe").load(sequence.path / METADATA)["rosbag2_bagfile_information"]
+        listed = [(topic["topic_metadata"], topic["message_count"]) for topic in about["topics_with_message_count"]]
+        stated = {topic["name"]: count for topic, count in listed if images or topic["type"] not in IMAGES}
+        counts = {name: max(log.counts.get(name, 0), stated.get(name, 0)) for name in {**stated, **log.counts}}
+    except (YAMLError, *MALFORMED) as error:
+        raise _refusal(sequence.path, error) from error
+    identity = {"format": "ros2_bag", "sequence": sequence.name}
+    return replace(log, counts=counts, metadata={**log.metadata, "imutool": identity})
 
 
 def read(source: Path) -> Iterator[MessageLog]:
@@ -120,14 +152,22 @@ def _topic(connection: Any, path: Path, remarks: Remarks) -> MessageTopic:
         metadata += (("offered_qos_profiles", dump_qos_v8(connection.ext.offered_qos_profiles)),)
     if form in ENCODINGS:
         return MessageTopic(connection.topic, kind, ENCODINGS[form], connection.msgdef.data.encode(), "cdr", metadata)
+    return _with_definition(MessageTopic(connection.topic, kind, "", b"", "cdr", metadata), path=path, remarks=remarks)
+
+
+def _with_definition(topic: MessageTopic, *, path: Path, remarks: Remarks) -> MessageTopic:
+    """The topic, with the definition of ROS 2 Jazzy or of .msg files where the bag has none."""
+    kind = topic.schema_name
+    if topic.schema or topic.message_encoding != "cdr" or not kind:
+        return topic
     known = ros2_definition(kind)
     text, missing = (known[0], "") if known else definition_from_files(kind, path if path.is_dir() else path.parent)
     if missing:
-        kept = f"{connection.topic} has no definition of its {kind}: its messages are kept as they are"
+        kept = f"{topic.name} has no definition of its {kind}: its messages are kept as they are"
         fix = f"source its ROS workspace, or copy {missing.rpartition('/')[2]}.msg into the bag's folder, and convert again"
         remarks.notes.append(f"{kept}; to have its numbers, {fix}")
-        return MessageTopic(connection.topic, kind, "", b"", "cdr", metadata)
-    return MessageTopic(connection.topic, kind, "ros2msg", text, "cdr", metadata)
+        return topic
+    return replace(topic, schema_encoding="ros2msg", schema=text)
 
 
 def _messages(path: Path, topics: dict[str, MessageTopic]) -> Iterator[Message]:
@@ -139,11 +179,19 @@ def _messages(path: Path, topics: dict[str, MessageTopic]) -> Iterator[Message]:
                 yield Message(topics[connection.topic], time_ns, time_ns, plain_cdr(payload))
 
 
+def _text(folder: Path) -> str:
+    return (folder / METADATA).read_text(encoding="utf-8", errors="replace") + "\n"
+
+
+def _named(folder: Path) -> list[str]:
+    """Names of the storage files in metadata.yaml."""
+    match = LISTED.search(_text(folder))
+    return [PurePath(line.strip()[2:].strip("'\" ")).name for line in match[1].splitlines()] if match else []
+
+
 def _misleads(folder: Path, remarks: Remarks) -> bool:
     """Whether metadata.yaml names no storage, or files that are not there, but others are; fewer than it names are a loss."""
-    text = (folder / METADATA).read_text(encoding="utf-8", errors="replace") + "\n"
-    match = LISTED.search(text)
-    named = [PurePath(line.strip()[2:].strip("'\" ")).name for line in match[1].splitlines()] if match else []
+    text, named = _text(folder), _named(folder)
     missing = [name for name in named if not (folder / name).exists()]
     there = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in (".db3", ".mcap"))
     if there and not any(re.search(STATED.format(key), text) for key in ("storage_identifier", "compression_format")):
@@ -191,6 +239,11 @@ def _open(path: Path, remarks: Remarks) -> Iterator[list[Any]]:
                 stack.callback(reader.close)
             yield readers
     except (ReaderError, apsw.Error, OSError, EOFError, zlib.error, *MALFORMED) as error:
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        fix = "Save what is intact of each .mcap with imutool repair, and convert that" if with_suffix(path, ".mcap") else ""
-        raise DataError(f"cannot be read as a ROS 2 bag ({reason})", where=path, fix=fix) from error
+        raise _refusal(path, error) from error
+
+
+def _refusal(path: Path, error: Exception) -> DataError:
+    """Error of a bag that cannot be read."""
+    reason = str(error).partition("\n")[0] or type(error).__name__
+    fix = "Save what is intact of each .mcap with imutool repair, and convert that" if with_suffix(path, ".mcap") else ""
+    return DataError(f"cannot be read as a ROS 2 bag ({reason})", where=path, fix=fix)

@@ -12,7 +12,6 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, ForwardRef, NamedTuple, TypeAlias
 from urllib.parse import unquote, urlsplit
@@ -73,7 +72,7 @@ def to_location(text: str) -> Location:
             `-`, which is elsewhere a stream.
     """
     if text == "-":
-        what = "is a stream: a log is read by its indexes, and checked after it is written"
+        what = "is a stream: a log is read by its indexes, and what is written is complete before it gets its name"
         raise ConfigError(what, where="-", expected="a file or a URL", fix="Name a file; one called - is ./-")
     scheme, colon, rest = text.partition("://")
     if not colon:
@@ -209,10 +208,17 @@ def refuse_twins(logs: Sequence[Location], parameter: str) -> None:
     Raises:
         ConfigError: with both names.
     """
-    for first, second in combinations(logs, 2):
-        if same_location(first, second):
-            what = f"{first} and {second} are one log" if first != second else f"{first} is given twice"
+    seen: dict[object, Location] = {}
+    for log in logs:
+        try:
+            file = log.stat() if isinstance(log, Path) else None
+        except (OSError, ValueError):  # whoever reads it says so
+            continue
+        key = str(log) if file is None else (file.st_dev, file.st_ino)
+        if (first := seen.get(key)) is not None:
+            what = f"{first} and {log} are one log" if first != log else f"{log} is given twice"
             raise ConfigError(what, where=parameter, expected="each log once")
+        seen[key] = log
 
 
 def identity(where: Location) -> tuple[int, str]:

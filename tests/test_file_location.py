@@ -22,7 +22,7 @@ from support.in_process import run_command
 import imutool as api
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError, redact
-from imutool.file_location import BLOCK_BYTES, reason, same_location, to_location
+from imutool.file_location import BLOCK_BYTES, reason, refuse_twins, same_location, to_location
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite
@@ -283,6 +283,19 @@ def test_a_log_that_is_given_twice_is_refused(imutool: Any, tmp_path: Path, logs
     run = api.diagnose if words == ["diagnose"] else partial(api.train, out=tmp_path / "m.safetensors")
     with pytest.raises(ConfigError, match="is given twice"):
         run([tmp_path / "a.mcap", str(tmp_path / "a.mcap")])
+
+
+def test_a_file_is_asked_for_once_to_find_logs_that_are_given_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three thousand logs took half a minute of pairs."""
+    logs = [tmp_path / f"{number}.mcap" for number in range(20)]
+    for log in logs:
+        log.touch()
+    asked, stat = [], Path.stat
+    monkeypatch.setattr(Path, "stat", lambda path, **how: asked.append(path) or stat(path, **how))
+    refuse_twins([*logs, tmp_path / "missing", tmp_path / "missing"], "logs")
+    assert len(asked) == len(logs) + 2
+    with pytest.raises(ConfigError, match="is given twice"):
+        refuse_twins([*logs, logs[3]], "logs")
 
 
 def test_a_name_with_a_zero_byte_is_said() -> None:

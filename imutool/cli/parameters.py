@@ -116,7 +116,7 @@ def error_with_flags(error: ImutoolError, flag_of: Mapping[str, str], typed: Col
 
 
 def _of_url(text: str) -> Path:
-    """File that a URL names, where only files are taken."""
+    """File that a URL names, where only files are taken, and no stream."""
     place = location(text)
     if not isinstance(place, Path):
         raise ConfigError("is in an object store", where=text, expected="a file on this machine")
@@ -143,7 +143,8 @@ class PlainValue:
         if self._kind is None or unreadable or not all(isinstance(word, str | Path) for word in words):
             return self._otherwise().coerce(value, param=param, ctx=ctx)
         ctx.meta[f"{FOLDERS}{param.name}"] = any(str(word).endswith(("/", os.sep)) for word in words)  # a Path does not
-        found = [_of_url(word) if self._kind is Path and "://" in str(word) else self._kind(word) for word in words]
+        special = [self._kind is Path and ("://" in str(word) or word == "-") for word in words]
+        found = [_of_url(word) if other else self._kind(word) for word, other in zip(words, special, strict=True)]
         return found if several else found[0]
 
     @staticmethod

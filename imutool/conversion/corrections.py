@@ -26,6 +26,7 @@ from imutool.log_info.pose_imu_rotation import Body
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import NO_ORIENTATION
 from imutool.mcap_io.codec.reflection import Reflected
+from imutool.mcap_io.recovery.losses import LATEST_NS
 from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES, VELOCITY_KEY
 from imutool.recording.message_log import Message, MessageLog, MessageTopic
 
@@ -141,7 +142,8 @@ class Corrections:
         self._correct_poses(topic, patch)
         moved_ns = patch.stamp_ns() - before_ns
         if abs(moved_ns) > SAME_CLOCK_NS:
-            message = message._replace(log_time=message.log_time + moved_ns, publish_time=message.publish_time + moved_ns)
+            published = message.publish_time + moved_ns if 0 < message.publish_time < LATEST_NS else message.publish_time
+            message = message._replace(log_time=message.log_time + moved_ns, publish_time=max(published, 0))
         return message._replace(payload=bytes(patch.data))
 
     @cached_property

@@ -153,7 +153,8 @@ class _Stream:
             if (number := self.channels.get(topic)) is None:
                 number = self._define(topic, payload)
             if not 0 <= log_time <= LATEST_NS:
-                raise DataError(f"a message of {topic.name} has the time {log_time} ns", expected="a time from 1970 to 2262")
+                what, fix = f"a message of {topic.name} has the time {log_time} ns", "imutool repair leaves it out"
+                raise DataError(what, expected="a time from 1970 to 2262", fix=fix)
             if last is not None and abs(log_time - last) > longest and len(jumps) < MOST_JUMPS:
                 before, jump = set(self._begun), (log_time, (log_time - last) * 1e-9)
             if number in before:  # and no topic with a clock of its own

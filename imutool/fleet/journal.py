@@ -118,8 +118,7 @@ class Journal:
 
     def done(self, key: str) -> Result | None:
         """Result of a log, if the journal has one."""
-        place = self._done.get(key)
-        if place is None:
+        if (place := self._done.get(key)) is None:
             return None
         self._file.seek(place[0])
         result = _decoded(self._file.read(place[1]))
@@ -150,6 +149,8 @@ class Journal:
 
     def _append_bytes(self, raw: bytes) -> tuple[int, int]:
         """Append without a buffer: on a full disk it would keep what it could not write, for whatever comes next."""
+        if self._pieces is None and not self.path.exists():
+            raise ConfigError("is gone: OUT was moved or removed", where=self.path, fix="Put it back, and go on with `resume`")
         at = self._file.seek(0, os.SEEK_END)
         try:
             _write_whole(self._file, raw)
@@ -160,9 +161,8 @@ class Journal:
         except io_errors(self.path) as error:
             with contextlib.suppress(OSError):
                 self._file.truncate(at)
-            raise ConfigError(
-                f"cannot be written ({reason(error)})", where=self.path, fix="Make room, and go on with `resume`"
-            ) from error
+            what, fix = f"cannot be written ({reason(error)})", "Make room, and go on with `resume`"
+            raise ConfigError(what, where=self.path, fix=fix) from error
         return at, len(raw)
 
     def _lock(self) -> None:

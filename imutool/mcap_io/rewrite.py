@@ -37,6 +37,7 @@ from imutool.mcap_io.verify import Verified, check_data_crc, check_mode, stated_
 from imutool.mcap_io.write import CHUNK_BYTES
 from imutool.processes.system import give
 
+REPAIR = "imutool repair sets them right"
 RUN_BYTES = 16 << 20  # of the source are copied at once; progress is reported between
 Values = Mapping[str, Mapping[str, str]]  # the entries of metadata records, by the records' names
 
@@ -256,6 +257,8 @@ class _Rewrite:
 
     def _list_chunk(self, block: MessageBlock, head: ChunkHead, indexes: MessageIndexes, moved: int) -> None:
         """Enters a chunk with its own message indexes in the summary."""
+        if head[:2] != (indexes.start_ns, indexes.end_ns):
+            raise LogError(f"the times of the chunk at byte {block.offset} are not those of its messages", fix=REPAIR)
         self.unchecked += 0 if head.crc else sum(indexes.counts.values())
         entry = head.index_at(block.offset + moved, block.length)
         entry.message_start_time, entry.message_end_time = indexes.start_ns, indexes.end_ns

@@ -11,7 +11,7 @@ import numpy as np
 
 from imutool.array_types import Bool, Float64, Int64, Shaped, UInt8, UInt32
 from imutool.errors import LogError
-from imutool.mcap_io.codec import messages, schemas
+from imutool.mcap_io.codec import messages, ros2_definition, schemas
 from imutool.mcap_io.codec.decode import (
     ImuBatch,
     PoseBatch,
@@ -234,7 +234,8 @@ def topics_of(index: LogIndex) -> dict[str, Topic]:
             MappingProxyType(dict(channel.metadata)),
         )
         if before and (before.schema_name, before.message_encoding) != (topic.schema_name, topic.message_encoding):
-            raise LogError(f"{channel.topic} carries {before.schema_name} and {topic.schema_name}")
+            both = " and ".join(f"{t.schema_name or 'no type'} in {t.message_encoding}" for t in (before, topic))
+            raise LogError(f"{channel.topic} carries {both}", expected="messages of one type")
         found[channel.topic] = topic
     return found
 
@@ -250,12 +251,10 @@ def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callab
     for name, topic in topics.items():
         if topic.message_encoding not in REFLECTED or RECORDED_KEY in topic.metadata:
             continue
-        definition = definitions[name]
-        schema = definition.data if definition else b""
+        schema = definition.data if (definition := definitions[name]) else b""
         try:
-            if (several := TYPE.fullmatch(topic.schema_name)) and (
-                form := format_of(topic.message_encoding, topic.schema_name, schema)
-            ):
+            several = TYPE.fullmatch(topic.schema_name)
+            if several and (form := format_of(topic.message_encoding, topic.schema_name, schema)):
                 found[name] = _as_ros(topic, Transforms(form, bool(several[1])))
                 continue
             raw = first(name) if topic.message_encoding == "json" else None
@@ -270,6 +269,8 @@ def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callab
         described = (topic.schema_encoding, topic.message_encoding) == ("ros2msg", "cdr") and not topic.is_derived
         definition = definitions[name] if described else None
         if definition is not None and (imu := reflect_cdr(topic.schema_name, definition.data)) is not None:
+            texts = {index.schemas[c.schema_id].data for c in index.channels.values() if c.topic == name and c.schema_id}
+            ros2_definition.refuse_two(name, topic.schema_name, [ros2_definition.parse(topic.schema_name, t) for t in texts])
             found[name] = _as_ros(topic, imu)
     return found
 
@@ -295,5 +296,5 @@ def joined_topic(gyro: Topic, accel: Topic, rows: Callable[[str], Iterator[Rows]
 
 def _column(parts: Iterable[Iterator[Vectors]]) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
     every = [vectors for part in parts for vectors in part]
-    stamps, values = [vectors.stamp_ns for vectors in every], [vectors.values for vectors in every]
-    return np.concatenate([np.zeros(0, np.int64), *stamps]), np.concatenate([np.zeros((0, 3)), *values])
+    stamps = np.concatenate([np.zeros(0, np.int64), *(vectors.stamp_ns for vectors in every)])
+    return stamps, np.concatenate([np.zeros((0, 3)), *(vectors.values for vectors in every)])

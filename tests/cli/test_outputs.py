@@ -231,6 +231,13 @@ def test_a_file_that_is_named_as_a_folder_is_refused(refused: Refused, tmp_path:
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.parametrize(("command", "parameter"), [case for case in OUTPUTS if case[1] != "json_to" and case[0] != "convert"])
+def test_a_stream_is_refused_where_a_file_is_written(refused: Refused, tmp_path: Path, command: str, parameter: str) -> None:
+    """`view LOG --html -` wrote a file `-`; of --json, - is stdout; `convert` looks at its source first."""
+    assert "-: is a stream" in refused(CONFIG, command, *line(command, parameter, "-"))
+    assert not (tmp_path / "-").exists()
+
+
 PAIRS = [
     (name, first, second)
     for name, first in FILES

@@ -288,8 +288,8 @@ def test_poses_of_another_frame_keep_their_clock(tmp_path: Path) -> None:
     content = module.read_sequence(next(iter(module.sequences(tmp_path / "both.mcap"))))
 
     def renamed(message: Message) -> Message:
-        if message.topic.name != "/odom/pose":
-            return message
+        if message.topic.name != "/odom/pose":  # publishers may have no clock, or another one
+            return message._replace(publish_time=[0, 5, 2**64 - 1][message.log_time % 3])
         return message._replace(payload=bytes(message.payload).replace(b"world", b"earth"))
 
     renamed_content = replace(content, messages=lambda: map(renamed, content.messages()))
@@ -297,6 +297,7 @@ def test_poses_of_another_frame_keep_their_clock(tmp_path: Path) -> None:
     times = {name: [m.log_time for m in corrected if m.topic.name == name] for name in ("/imu0", "/mocap/pose", "/odom/pose")}
     assert times["/odom/pose"] == made.truth.t_ns.tolist()
     assert times["/mocap/pose"] == made.truth.t_ns.tolist()
+    assert {m.publish_time for m in corrected if m.topic.name == "/mocap/pose"} == {0, 2**64 - 1}
     assert [m.log_time for m in corrected] == sorted(m.log_time for m in corrected)
 
 

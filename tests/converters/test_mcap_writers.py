@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.records import Chunk, Message, Metadata
 from mcap.writer import IndexType, Writer
 
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu
+from imutool.mcap_io.codec.records import build
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 
@@ -77,6 +79,33 @@ def test_metadata_of_one_name_are_kept_and_attachments_are_a_loss(convert, tmp_p
     with (tmp_path / "out.mcap").open("rb") as file:
         found = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
     assert found["rig"] == {"camera": "left", "mount": "roof"}
+
+
+def _append(path: Path, records: bytes) -> None:
+    """Put records behind the last chunk of a log without summary offsets and CRCs."""
+    raw = path.read_bytes()
+    start = int.from_bytes(raw[-28:-20], "little")
+    data_end, footer = start - 13, raw[start:-28] + (start + len(records)).to_bytes(8, "little") + raw[-20:]
+    path.write_bytes(raw[:data_end] + records + raw[data_end:start] + footer)
+
+
+@pytest.mark.parametrize("statistics", [True, False])
+def test_what_no_index_lists_is_converted_or_said(convert, tmp_path, statistics):
+    options = {"use_statistics": statistics, "use_summary_offsets": False, "enable_crcs": False}
+    source = write_log(tmp_path / "in.mcap", **options)
+    t_ns = T_NS + (T_NS[-1] - T_NS[0] + 5_000_000)
+    rows, later = encode_imu(t_ns, GYRO, ACCEL, "imu"), t_ns.tolist()
+    more = [build(Message(1, t, row.tobytes(), t, 0)) for t, row in zip(later, rows, strict=True)]
+    unlisted = b"".join(more[100:])
+    chunk = Chunk("", unlisted, later[-1], later[100], 0, len(unlisted))
+    rig = [build(Metadata("rig", {"mount": place})) for place in ("roof", "floor")]
+    _append(source, b"".join([*more[:100], build(chunk), *rig, b"\x80" + bytes(8)]))
+    done = convert(source, tmp_path / "out.mcap")
+    assert done.returncode == 3, done.stderr
+    assert "not carried over: 1 of 0x80" in done.stderr
+    assert "later values replace others: mount of rig" in done.stderr
+    assert "100 messages lie outside chunks" in done.stderr
+    assert read(tmp_path / "out.mcap").imu.t_ns.tolist() == [*T_NS.tolist(), *later]
 
 
 @pytest.mark.parametrize("options", [{}, {"use_statistics": False}])

@@ -62,6 +62,16 @@ def test_a_full_disk_is_told_with_the_journal_and_what_to_do(tmp_path: Path) -> 
         assert journal.ours("0.mcap")
 
 
+def test_a_folder_that_is_moved_away_ends_the_run(tmp_path: Path) -> None:
+    """The workers made it anew, and the run ended well with half of its logs elsewhere."""
+    with Journal(tmp_path / "out", SETTINGS) as journal:
+        journal.begin("a", "a.mcap")
+        (tmp_path / "out").rename(tmp_path / "moved")
+        (tmp_path / "out").mkdir()
+        with pytest.raises(ConfigError, match="is gone: OUT was moved or removed"):
+            journal.finish(result("a"))
+
+
 def test_cut_off_anywhere_the_journal_knows_all_whole_lines(tmp_path: Path) -> None:
     fill(tmp_path, "a", "b")
     whole = (tmp_path / NAME).read_bytes()

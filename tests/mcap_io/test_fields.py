@@ -266,6 +266,20 @@ def test_two_definitions_of_a_topics_messages_are_never_mistaken_for_one(tmp_pat
         read_field(tmp_path / "merged.mcap", "/a.a")
 
 
+def test_two_layouts_of_an_imu_s_messages_are_never_mistaken_for_one(tmp_path: Path) -> None:
+    """The gyro of the first log was read as the accelerometer."""
+    with (tmp_path / "merged.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for n, order in enumerate(("gyro accel", "accel gyro")):
+            definition = "".join(f"float64[3] {sensor}\n" for sensor in order.split()).encode()
+            channel = writer.register_channel("/imu", "cdr", writer.register_schema("a/msg/RawImu", "ros2msg", definition))
+            writer.add_message(channel, START_NS + n, struct.pack("<I6d", 0x100, *range(6)), START_NS + n)
+        writer.finish()
+    with pytest.raises(LogError, match="two definitions of a/msg/RawImu are on /imu"):
+        Log(tmp_path / "merged.mcap")
+
+
 def raw(path: Path, definition: bytes, payload: bytes, *, name: str = "a/msg/A", language: str = "ros2msg") -> Path:
     """A log with one message of any definition and bytes."""
     with path.open("wb") as file:

@@ -113,7 +113,8 @@ def write_mix(path: Path, mix: list[tuple[str, int, int]], layout: dict[str, Any
             stamps = np.array([1_000_000 * (number + 1)])
             frame = "x" * (size % 7)  # payloads of several lengths, and not all of one layout
             payload = encode_imu(stamps, rng.normal(size=(1, 3)), np.ones((1, 3)), frame)[0].tobytes()
-            rows.append((topic, log_time, log_time + 1, number, payload if "imu" in topic else rng.bytes(size)))
+            published = log_time + 1 if number % 3 else 2**64 - 1 - log_time  # a publisher may have no clock
+            rows.append((topic, log_time, published, number, payload if "imu" in topic else rng.bytes(size)))
             writer.add_message(ids[topic], *(rows[-1][k] for k in (1, 4, 2, 3)))
             if number == 5:
                 writer.add_attachment(1, 2, "a.bin", "x/y", rng.bytes(2_000))

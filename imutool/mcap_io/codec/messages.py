@@ -213,10 +213,10 @@ def columns(heads: Shaped[np.ndarray, " n"], payload: UInt8[np.ndarray, "n L"]) 
     """Messages of one size as columns.
 
     Raises:
-        LogError: a time beyond 2^63 ns.
+        LogError: a log time beyond 2^63 ns.
     """
-    times = signed(heads["log_time"]), signed(heads["publish_time"])
-    return Rows(heads["channel"].copy(), *times, heads["sequence"].copy(), payload)
+    publish_time = heads["publish_time"].astype(np.int64)  # only copied: whatever a publisher's clock shows, its bits stay
+    return Rows(heads["channel"].copy(), signed(heads["log_time"]), publish_time, heads["sequence"].copy(), payload)
 
 
 def joined(parts: Iterable[Rows]) -> Iterator[Rows]:

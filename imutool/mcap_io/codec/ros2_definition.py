@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from imutool.errors import LogError
@@ -88,6 +88,18 @@ def parse(schema_name: str, text: bytes) -> Definition:
         known[name] = tuple(_fields(name, body))
     _check(root, known, {}, 0)
     return {**known, "": (Field("", root, None),)}  # last: a separator with nothing after it defines "" too
+
+
+def refuse_two(topic: str, schema_name: str, definitions: Iterable[Definition]) -> None:
+    """Refuse definitions that lay out one message differently, as in merged logs.
+
+    Raises:
+        LogError: they do.
+    """
+    layouts = [{name: [f._replace(comment="") for f in fields] for name, fields in each.items()} for each in definitions]
+    if any(layout != layouts[0] for layout in layouts):
+        what = f"two definitions of {schema_name} are on {topic}"
+        raise LogError(what, expected="one", fix="Read the logs one by one that were merged to this one")
 
 
 def _short(name: str) -> str:

@@ -19,7 +19,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import ros2_definition, schemas
 from imutool.mcap_io.codec.formats import LACKS, MAX_ROW, NumberFormat, Path, fields_of, stamps_of
 from imutool.mcap_io.codec.reflection import format_of, tree_of
-from imutool.mcap_io.codec.ros2_definition import Definition, Field, Leaf
+from imutool.mcap_io.codec.ros2_definition import Definition, Leaf
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import REFLECTED, Topic
 
@@ -98,14 +98,8 @@ def _check_alone(log: Log, topic: Topic, definition: Definition, parse: Callable
         LogError: they do.
     """
     numbers = {channel.schema_id for channel in log.index.channels.values() if channel.topic == topic.name}
-    for data in {log.index.schemas[number].data for number in numbers if number in log.index.schemas}:
-        if _layout(parse(topic.schema_name, data)) != _layout(definition):
-            what = f"two definitions of {topic.schema_name} are on {topic.name}"
-            raise LogError(what, expected="one", fix="Read the logs one by one that were merged to this one")
-
-
-def _layout(definition: Definition) -> dict[str, list[Field]]:
-    return {name: [field._replace(comment="") for field in fields] for name, fields in definition.items()}
+    texts = {log.index.schemas[number].data for number in numbers if number in log.index.schemas}
+    ros2_definition.refuse_two(topic.name, topic.schema_name, [definition, *(parse(topic.schema_name, t) for t in texts)])
 
 
 def _parse_idl(schema_name: str, text: bytes) -> Definition:

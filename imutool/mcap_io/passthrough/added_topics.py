@@ -161,7 +161,7 @@ class DerivedStream:
         """Put messages of differing sizes, side by side for each source message."""
         parts: list[bytes] = []
         sizes: list[int] = []
-        times = batch.sequence.tolist(), batch.log_time.tolist(), batch.publish_time.tolist()
+        times = batch.sequence.tolist(), batch.log_time.tolist(), batch.publish_time.view(np.uint64).tolist()
         for n, (sequence, log_ns, publish_ns) in enumerate(zip(*times, strict=True)):
             for channel, of_topic in zip(self.ids, payloads, strict=True):
                 payload = bytes(of_topic[n])

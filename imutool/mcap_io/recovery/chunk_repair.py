@@ -146,10 +146,10 @@ def _candidates(raw: bytes, known: ChunkIndex | None) -> Iterator[bytes]:
 def keeps_sound(head: records.ChunkHead, raw: bytes, found: messages.Messages) -> bool:
     """Whether a chunk that is copied as it is can be told to be sound.
 
-    Without a CRC its head must agree with its messages: nothing else tells the next reader that it is sound. A frame of
-    lz4 must end where its data do, since other readers refuse it otherwise.
+    Its head must agree with its messages: the summary of the copy does. A frame of lz4 must end where its data do, since
+    other readers refuse it otherwise.
     """
-    if not head.crc and len(found.heads) and (head.start_ns, head.end_ns) != messages.span(found.times()):
+    if len(found.heads) and (head.start_ns, head.end_ns) != messages.span(found.times()):
         return False
     packed = raw[head.data_at :]
     if head.compression != "lz4":

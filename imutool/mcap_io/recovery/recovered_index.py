@@ -122,7 +122,10 @@ class RecoveredIndex(LogIndex):
         """The messages of a block whose channel is defined and whose time is possible."""
         if not self.by_records:
             found = super().unpack_bytes(block, raw)
-            found.times()
+            times = found.times()
+            if len(times) and (block.start_ns, block.end_ns) != (span := messages.span(times)):
+                self.losses.add_harmless(f"the times of the chunk at byte {block.offset} are not those of its messages")
+                block.start_ns, block.end_ns = span
         else:
             found = self._parse(block, raw)
         crc = 0 if block.compression is None else CHUNK_HEAD.unpack_from(raw, HEAD.size)[3]

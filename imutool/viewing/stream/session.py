@@ -180,9 +180,7 @@ class _Session:
         )
         seen = imu_of(self._first[run])
         check_first(seen, self._model)
-        warm = [
-            (found.stamp_ns, float(found.temperature)) for found in sorted(self._first[run]) if found.temperature is not None
-        ]
+        warm = sorted((found.stamp_ns, float(t)) for found in self._first[run] if (t := found.temperature) is not None)
         first_ns, last_ns = int(seen.t_ns[0]), int(seen.t_ns[-1])
         model = started_at(self._model, warm, first_ns, last_ns)
         model = with_earlier_load(model, [model_samples(model, seen)], first_ns)

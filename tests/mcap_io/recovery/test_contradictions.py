@@ -18,6 +18,7 @@ from imutool.mcap_io.codec.records import HEAD, MAGIC
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import RepairReport, repair
+from imutool.mcap_io.rewrite import rewrite
 
 Messages = list[tuple[str, str, int, int, int, bytes]]
 Foreign = Callable[..., Path]
@@ -106,6 +107,23 @@ def test_a_chunk_that_is_there_twice_is_kept_once(log: Path) -> None:
     found, report = saved(log)
     assert found == Counter(m for _, _, each in whole for m in each)
     assert any("repeats the one" in line for line in report.losses.harmless)
+
+
+def test_times_of_a_chunk_that_are_not_those_of_its_messages_are_set_right(log: Path, tmp_path: Path) -> None:
+    raw = log.read_bytes()
+    with Log(log) as before:
+        summary, block = before.index.footer.summary_start, before.index.blocks[3]
+    raw = raw.replace(struct.pack("<QQ", block.start_ns, block.end_ns), bytes(16))  # in the chunk and in the summary
+    crc = zlib.crc32(raw[summary:-12])
+    log.write_bytes(raw[:-12] + crc.to_bytes(4, "little") + MAGIC)
+    found, report = saved(log)
+    assert found == Counter(by_mcap(log))
+    assert report.losses.harmless == [f"the times of the chunk at byte {block.offset} are not those of its messages"]
+    with RecoveredLog(log.with_name("saved.mcap")) as after:
+        after.check()
+        assert after.losses.intact
+    with pytest.raises(LogError, match="are not those of its messages"):
+        rewrite(log, tmp_path / "out.mcap", [], metadata={})
 
 
 @pytest.mark.parametrize("over", [45, 44, 43, 36])

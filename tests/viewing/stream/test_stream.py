@@ -183,6 +183,11 @@ def test_one_stray_stamp_does_not_end_the_wait_for_the_start(imu: Imu, stray_ns:
     assert "the clock jumps" in caplog.text
 
 
+def test_a_sample_may_come_again_without_its_temperature(imu: Imu) -> None:
+    twice = [again for each in stream(imu.rows(slice(0, 600))) for again in (each._replace(temperature=20.0), each)]
+    assert run(iter(twice), api.load_model("static"), Malformed()).out_of_order == 600
+
+
 def test_a_clock_that_begins_below_zero_does_not_jump(imu: Imu, caplog: pytest.LogCaptureFixture) -> None:
     """As one that counts to an event; its seconds were counted from zero, and nothing of it was shown."""
     early = [found._replace(stamp_ns=found.stamp_ns - int(imu.t_ns[0]) - 10**15) for found in stream(imu)]
