@@ -139,6 +139,8 @@ def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
         ([f"gyro {a} (in degrees/s)" for a in "xyz"], [f"acc {a} (in m/s^2)" for a in "xyz"]),
         ([f"gyro {a} [degrees per second]" for a in "xyz"], [f"accel_{a}" for a in "xyz"]),
         ([f"ang_vel_{a} [deg/s]" for a in "xyz"], [f"acc_b_{a}" for a in "xyz"]),
+        ([f"G{a}_IMU (deg/s)" for a in "xyz"], [f"A{a}_IMU" for a in "xyz"]),
+        ([f"w.{a} (deg/s)" for a in "xyz"], [f"f.{a}" for a in "xyz"]),  # of structures
         ([f"gyroADC[{k}] (deg/s)" for k in range(3)], [f"accSmooth[{k}] (m/s/s)" for k in range(3)]),  # blackbox_decode
     ],
 )
