@@ -76,6 +76,7 @@ class Columns:
             return
         if array.dtype.kind not in "iufb" or array.ndim > 3 or not array.size:
             return
+        array = array.astype(np.int64) if array.dtype.kind in "iu" and array.dtype.itemsize < 8 else array  # steps overflow
         if array.ndim == 3:
             array = np.moveaxis(array, 2, 0) if array.shape[:2] == (3, 3) else array
             if array.shape[1:] == (3, 3):

@@ -25,7 +25,16 @@ from . import Sequence, _unpacking
 from ._source import head, name
 from ._table_files import kind_of, load
 from ._table_folder import load_split, sequences_below
-from ._table_groups import MOST_CONSTANTS, group_entries, imus_apart, pose_clock, position_beside, shared_group, time_beside, turned
+from ._table_groups import (
+    MOST_CONSTANTS,
+    group_entries,
+    imus_apart,
+    pose_clock,
+    position_beside,
+    shared_group,
+    time_beside,
+    turned,
+)
 from ._table_layouts import known_layout
 from ._table_map import (
     IMU_TOPIC,

@@ -217,7 +217,8 @@ def test_a_rate_is_kept_where_the_gyro_is_not_recognised(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "above", ["// Start Time: Unknown\n// Update Rate: 250.0Hz\n", "# Config: data_rate = 250.0 Hz, filter = 488 Hz, range = 4 g\n"]
+    "above",
+    ["// Start Time: Unknown\n// Update Rate: 250.0Hz\n", "# Config: data_rate = 250.0 Hz, filter = 488 Hz, range = 4 g\n"],
 )
 def test_a_counter_that_begins_again_tells_missing_samples_at_the_rate_above_the_table(tmp_path, above):
     names = ["PacketCounter", *(f"Acc_{a}" for a in "XYZ"), *(f"Gyr_{a} [rad/s]" for a in "XYZ")]
