@@ -21,6 +21,7 @@ from ._table_json import is_json, load_json
 from ._table_mat import check_size, load_mat, names_of_mat
 from ._table_merged import join_stamps, sort_by_clock
 from ._table_mocap import is_mocap, read_mocap
+from ._table_motion import add_gravity
 from ._table_names import group_of, leaf_of, tells_apart
 from ._table_numbers import is_number
 from ._table_packed import read_bytes, text_head
@@ -81,6 +82,7 @@ def load(path: Path, kind: str) -> Columns:
     join_gps_weeks(columns)
     read_clocks_and_days(columns)
     sort_by_clock(columns)
+    add_gravity(columns)
     if not columns.values:
         why = "".join(f"; {loss}" for loss in columns.remarks.losses[:1])
         raise DataError(f"{NO_NUMBERS}{why}", where=path, expected="a time, three rates and three accelerations")

@@ -8,12 +8,13 @@ from dataclasses import replace
 from itertools import chain
 
 from ._table_geodetic import fits_gravity
-from ._table_map import IMU_TOPIC, Entries, column_named
-from ._table_names import ESTIMATED, TIME_WORDS, group_of, name_and_unit, spaced_name, split_name, triples
+from ._table_map import IMU_TOPIC, POSE_GROUPS, Entries, column_named
+from ._table_names import ESTIMATED, TIME_WORDS, group_of, leaf_of, name_and_unit, spaced_name, split_name, triples
 from ._table_pose_names import (
     NED,
     NOT_ALIKE,
     NUMBERS,
+    POSITIONS,
     QUATERNION,
     QUATERNION_ARRAY,
     angles_of,
@@ -22,7 +23,7 @@ from ._table_pose_names import (
     matrix_of,
     position_of,
 )
-from ._table_rotations import EITHER_WAY, TURNS, angles_by_motion, matrix_by_motion, order_by_motion
+from ._table_rotations import EITHER_WAY, TURNS, angles_by_motion, matrix_by_motion, order_by_motion, seconds_of
 from ._table_text import Columns, matrix_columns
 from ._table_times import goes_on
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
@@ -58,13 +59,18 @@ def imus_apart(columns: Columns) -> dict[str, Columns]:
 
 
 def _paired(gyros: Mapping[str, Axes], accels: Mapping[str, Axes]) -> dict[str, list[Axes]]:
-    """Accelerations of each gyro's owner: `leg` has `leg_wide_range`; empty unless every one has some."""
+    """Accelerations of each gyro's owner: `leg` has `leg_wide_range`; empty unless every one has some.
+
+    An acceleration of no gyro, in a table of its own, is no part of an IMU.
+    """
     of: dict[str, list[Axes]] = {owner: [] for owner in gyros}
+    tables = {group_of(gyro["x"]).split("/")[0] for gyro in gyros.values()}
     for name, accel in accels.items():
         near = [owner for owner in gyros if name == owner or name.startswith(f"{owner}_")]
-        if not near:
+        if near:
+            of[max(near, key=len)].append(accel)
+        elif group_of(accel["x"]).split("/")[0] in tables:
             return {}
-        of[max(near, key=len)].append(accel)
     return of if all(of.values()) else {}
 
 
@@ -76,7 +82,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     that of a motion capture.
     """
     time, unit = str(entries["time"]), str(entries["time_unit"])
-    other = time_beside(columns, columns.unsigned(entries["accel"][0]), time, unit)
+    other = time_beside(columns, columns.unsigned(entries["accel"][0]), time, unit, apart=True)
     found: Entries = {"accel_time": other[0]} if other is not None and other[1] == unit else {}
     groups: dict[tuple[tuple[str, str], bool], dict[str, str]] = {}
     for column, values in columns.values.items():
@@ -98,7 +104,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
         if turns:
             poses.append((not named_true, clock, turns, position))
         elif clock[0] != time or named_true or bodies:
-            reasons += _why_no_turns(columns, leaves, bodies)
+            reasons += _why_no_turns(columns, leaves, bodies, _said_apart(columns, clock, (time, unit)))
     for is_estimate, clock, turns, position in sorted(poses, key=lambda each: (each[0], each[1]))[:1]:
         found |= {"truth_time": clock[0], "truth_time_unit": clock[1], **turns}
         found["pose_kind"] = "estimate" if is_estimate else "truth"
@@ -106,8 +112,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
         if why or not position:
             reasons += filter(None, [why])
             continue
-        stated = name_and_unit(position[0], columns.units.get(position[0], ""))[1]
-        found |= {"position": position, "position_unit": stated if stated in POSITION_SI else "m"}
+        found |= {"position": position, "position_unit": _unit_of(columns, position)}
         if named := position_of({split_name(c.removeprefix(group_of(c)))[0]: c for c in position}, NED):
             found["pose_world"] = "ned"
             reasons.append(f"{', '.join(named)} are north, east and down: the poses are turned to east, north, up")
@@ -130,6 +135,22 @@ def turned(columns: Columns, entries: Entries) -> Entries:
     clock = str(entries["time"]), str(entries["time_unit"])
     found = _turns(columns, entries, leaves, clock, [])
     return entries | (found | {"truth_time": clock[0], "truth_time_unit": clock[1]} if found else {})
+
+
+def position_beside(columns: Columns, entries: Entries) -> Entries:
+    """Entries of the positions x, y, z in the table of poses of which a map names the rotations alone."""
+    named = next((each for name in TURNS if (each := entries.get(name))), "")
+    group = group_of(columns.unsigned(matrix_columns(named)[0])) if named and "truth_file" not in entries else ""
+    if "position" in entries or not f"{group}/".startswith(POSE_GROUPS):
+        return {}
+    position = position_of({split_name(leaf_of(c))[0]: c for c in columns.values if group_of(c) == group}, POSITIONS[:1])
+    return {"position": position, "position_unit": _unit_of(columns, position)} if position else {}
+
+
+def _unit_of(columns: Columns, position: list[str]) -> str:
+    """Stated unit of positions; else metres."""
+    stated = name_and_unit(position[0], columns.units.get(position[0], ""))[1]
+    return stated if stated in POSITION_SI else "m"
 
 
 def pose_clock(columns: Columns, entries: Entries) -> Entries:
@@ -171,17 +192,23 @@ def _turns(columns: Columns, entries: Entries, leaves: dict[str, str], clock: tu
     return found
 
 
-def _why_no_turns(columns: Columns, leaves: dict[str, str], bodies: list[dict[str, str]]) -> list[str]:
+def _said_apart(columns: Columns, clock: tuple[str, str], own: tuple[str, str]) -> str:
+    """Why turns cannot be compared, where the clock of rotations shares no time with the IMU's; else empty."""
+    (first, last), (start, end) = (seconds_of(columns, each)[[0, -1]] for each in (own, clock))
+    return ": their clocks share no time" if start > last or end < first else ""
+
+
+def _why_no_turns(columns: Columns, leaves: dict[str, str], bodies: list[dict[str, str]], apart: str) -> list[str]:
     """Reasons why the rotations of a group make no poses."""
     array = next((c[:-3] for c in leaves.values() if c.endswith("[3]") and f"{c[:-3]}[4]" not in columns.values), "")
     named = [array] if array else next(filter(None, (axes_of(QUATERNION_ARRAY, body, "0123") for body in bodies)), [])
     if named:
         return [f"{', '.join(named)} has four columns of no certain order; `quaternion_wxyz` of a map makes poses of them"]
     if nine := matrix_of(leaves):
-        said = f"{NOT_ALIKE}, nor do their transposes"
+        said = f"{NOT_ALIKE}, nor do their transposes{apart}"
         return [f"the matrices {nine[0]}, ... {said}; `rotation_matrix` of a map, row by row, makes poses of them"]
     if three := next(iter(angles_of(leaves)), []):
-        said = f"{NOT_ALIKE}, as Rz(yaw) Ry(pitch) Rx(roll)"
+        said = f"{NOT_ALIKE}, as Rz(yaw) Ry(pitch) Rx(roll){apart}"
         return [f"{', '.join(three)} {said}; `roll_pitch_yaw` of a map makes poses of them"]
     return []
 

@@ -11,13 +11,39 @@ from imutool.errors import DataError
 from imutool.recording.joined_imu import joined, steady_force, unit_by_gravity
 
 from ._table_map import Proposal
-from ._table_names import spaced_name
+from ._table_names import spaced_name, split_name
+from ._table_pose_names import axes_of
 from ._table_text import Columns
 from ._table_units import ACCEL_SI, GYRO_SI, STANDARD_GRAVITY, TIME_NS, gravity_units, is_motion_alone
 
 LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
 STEADY_BAND = 0.3  # share by which the steady part of the acceleration may differ from gravity
 NO_GRAVITY = r"(user|free)_?acc"  # in names of accelerations without gravity
+CORE_MOTION = {  # names of `CMDeviceMotion` on iOS and watchOS, as several programs write them
+    "rotation rate": r"(.*_)?rotation_?rate_?(?P<axis>[xyz])",
+    "gravity": r"(.*_)?(motion_?)?gravity_?(?P<axis>[xyz])",
+    "acceleration": r"(.*_)?(motion_?)?(user_?)?acceleration_?(?P<axis>[xyz])",
+}
+UNIT_BAND = 0.02  # of the length of a gravity in g
+
+
+def add_gravity(columns: Columns) -> None:
+    """Add the specific force to a table of CoreMotion: its acceleration is without gravity, which has columns of its own.
+
+    Both read -1 g along the axis that points up.
+    """
+    names = {split_name(column)[0]: column for column in columns.values}
+    rate, gravity, motion = (axes_of(form, names, "xyz") for form in CORE_MOTION.values())
+    if not (rate and gravity and motion) or len({len(columns.values[column]) for column in (*gravity, *motion)}) > 1:
+        return
+    values = columns.side_by_side(gravity)
+    length = np.linalg.norm(values[np.isfinite(values).all(axis=1)], axis=1)
+    if not len(length) or np.abs(np.quantile(length, [0.05, 0.95]) - 1.0).max() > UNIT_BAND:
+        return
+    for axis, each in zip("xyz", -(values + columns.side_by_side(motion)).T, strict=True):
+        columns.values[f"accelerometer_{axis} [g]"] = each
+    said = f"{motion[0]}/y/z and {gravity[0]}/y/z are of CoreMotion, which takes gravity out and reads -1 g upwards"
+    columns.remarks.notes.append(f"{said}: the accelerometer is minus their sum")
 
 
 def doubt_gravity(proposal: Proposal, columns: Columns) -> None:

@@ -51,7 +51,7 @@ WORDS = {
     "accel": r"accel((eration|erometer)s?)?|acc[el]?|ac|(?<![pr]_[a-z]{2}_)a|fb|g_?force|gf|linear_?acceleration"
     r"|specific_?force|sp_?force|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
 }
-STATES = r"_(raw|adc|counts?|(un)?cal(ib)?(rated)?)"  # of the numbers in a column
+STATES = r"_(raw|adc|counts?|(un)?cal(ib)?(rated)?|data|values?|readings?|meas(ured)?)"  # of the numbers in a column
 STATE = rf"(?P<state>({STATES})?)"
 PLACES = (  # of several IMUs on a body
     r"((left|right|upper|lower|l|r)_?)*(left|right|head|neck|chest|back|torso|trunk|sternum|pelvis|waist|hip|arm|forearm|wrist"
@@ -63,7 +63,7 @@ FORMS = (  # names of an axis, by falling preference; one of roll, pitch and yaw
     rf"(?P<of>(?:.*_)?)(?P<axis>[xyz])_(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",
     rf"(?P<sensor>(?:.*_)?(WORDS))_(?P<axis>roll|pitch|yaw){STATE}",
     rf"(?P<axis>roll|pitch|yaw)_?(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",
-    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[xyz])_?(?P<place>\d|{PLACES}){STATE}",  # ax1, acc_x_1, acc_x_chest
+    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[xyz])_?(?P<place>\d|{PLACES}|(imu|sensor)_?\d?){STATE}",  # ax1, acc_x_chest
     rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<place>\d|{PLACES})_?(?P<axis>[xyz]){STATE}",  # acc1_x, acc_chest_x
     rf"(?P<sensor>(?:.*_)?(WORDS))(?P<state>{STATES})_?(?P<axis>[xyz012])",  # acc_raw_x
 )
@@ -97,7 +97,8 @@ def _symbols(sensor: str, columns: Iterable[str]) -> dict[str, dict[str, str]]:
     for column in columns:
         leaves.setdefault(group_of(column), {})[column] = split_name(leaf_of(column))[0]
     found = {group: _triples(sensor, names, SYMBOLS[sensor]) for group, names in leaves.items()}
-    return {split_name(group)[0] if group else name: each for group in found for name, each in found[group].items()}
+    named = {split_name(group)[0] if group else name: each for group in found for name, each in found[group].items()}
+    return named or _triples(sensor, {column: split_name(column)[0] for column in columns}, SYMBOLS[sensor])  # f.x
 
 
 def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[str, str]]:

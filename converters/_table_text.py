@@ -76,6 +76,7 @@ class Columns:
             return
         if array.dtype.kind not in "iufb" or array.ndim > 3 or not array.size:
             return
+        array = array.astype(np.int64) if array.dtype.kind in "iu" and array.dtype.itemsize < 8 else array  # steps overflow
         if array.ndim == 3:
             array = np.moveaxis(array, 2, 0) if array.shape[:2] == (3, 3) else array
             if array.shape[1:] == (3, 3):
@@ -172,7 +173,8 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
         raise DataError("has a line of more than 65 536 characters", where=path, expected="a table of text")
     delimiter = _delimiter(lines, least)
     first = next((n for n, line in enumerate(lines) if _is_row(line, delimiter, least)), len(lines))
-    stated = filter(None, map(STATED_NUMBER.fullmatch, lines[:first]))
+    several = (part for line in lines[:first] if line.startswith(COMMENTS) for part in re.split(r", |: (?=.*=)", line))
+    stated = filter(None, map(STATED_NUMBER.fullmatch, [*lines[:first], *several]))
     columns.numbers |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in stated}
     values, fields, width = _columns_of(lines[first:], lines[:first], delimiter, columns)
     firsts = [row[0].strip().strip('"') for row in fields_of(lines[first : first + FIRSTS], delimiter) if len(row) == width]

@@ -115,14 +115,14 @@ def read(source: Path) -> Iterator[MessageLog]:
 
 
 def is_phone(path: Path, inside: str = "") -> bool:
-    """Whether a folder, or one of a zip, has a phone app's tables with a time, or OXTS."""
+    """Whether a folder, or one of a zip, has a phone app's tables with a time and x, y, z, or OXTS."""
     files = _files(path, inside)
     tables = files.tables()
     gyro = next((tables[table] for table in GYRO if table in tables), "")
     return any(map(OXTS.fullmatch, files.names)) or (
         bool(gyro)
         and any(table in tables for table in (*ACCEL, *LINEAR, "accelerometer"))
-        and re.search(r"\btime\b", files.text(gyro).partition("\n")[0], re.IGNORECASE) is not None
+        and all(re.search(rf"\b{word}\b|_{word}\b", files.text(gyro).partition("\n")[0].lower()) for word in ("time", *"xyz"))
     )
 
 

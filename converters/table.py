@@ -25,7 +25,16 @@ from . import Sequence, _unpacking
 from ._source import head, name
 from ._table_files import kind_of, load
 from ._table_folder import load_split, sequences_below
-from ._table_groups import MOST_CONSTANTS, group_entries, imus_apart, pose_clock, shared_group, time_beside, turned
+from ._table_groups import (
+    MOST_CONSTANTS,
+    group_entries,
+    imus_apart,
+    pose_clock,
+    position_beside,
+    shared_group,
+    time_beside,
+    turned,
+)
 from ._table_layouts import known_layout
 from ._table_map import (
     IMU_TOPIC,
@@ -181,7 +190,7 @@ def _proposal(columns: Columns, given: Entries) -> Proposal:
     if {"time", "time_unit", "gyro", "accel"} <= proposal.entries.keys():
         beside = group_entries(columns, proposal.entries, proposal.reasons)
         proposal.entries |= {name: beside[name] for name in beside if name == "accel_time" or not given.keys() & TURNS}
-        proposal.entries |= pose_clock(columns, proposal.entries)
+        proposal.entries |= pose_clock(columns, proposal.entries) | position_beside(columns, proposal.entries)
         tries = {"poses": {} if "truth_file" in given else proposal.entries, "orientations": turned(columns, proposal.entries)}
         units = (
             {kind: unit_by_poses(columns, entries) for kind, entries in tries.items()} if "gyro_unit" in proposal.open else {}

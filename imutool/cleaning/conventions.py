@@ -77,8 +77,11 @@ def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventio
         forces = _force_at_poses(step, force, motion.middle_ns, poses)
         accel, up, unit, other = _accel_against_poses(forces, gyro, carried)
         vertical = _mean_vertical(forces)
-        found.append(Conventions(truth.topic, gyro, accel, carried, up, delay, unit, what or other, vertical))
-    return max(found, key=lambda each: (each.up == "+z", each.accel is not None))  # of equals the first
+        conventions = Conventions(truth.topic, gyro, accel, carried, up, delay, unit, what or other, vertical)
+        turned = quaternion.rotate(forces.q_wb, forces.f @ gyro.axes.T) if gyro is not None else forces.f[:0]
+        level = len(turned) > 0 and axis_of_gravity(turned) == "+z"
+        found.append((conventions, (up == "+z", accel is not None, level)))
+    return max(found, key=lambda each: each[1])[0]  # of equals the first
 
 
 def _excited(rate: Float64[np.ndarray, "n 3"]) -> bool:

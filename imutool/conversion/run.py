@@ -17,9 +17,9 @@ from typing import Any
 from imutool import registry
 from imutool.conversion import Failure
 from imutool.conversion.corrections import CONVENTIONS, STAMPS
-from imutool.conversion.unread_formats import nothing_found
+from imutool.conversion.unread_formats import blamed, is_pointer, nothing_found, pointers_below
 from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
-from imutool.conversion.workers import GROUP, ConvertReport, Job, Progress, run_jobs, write_content
+from imutool.conversion.workers import GROUP, SUFFIX, ConvertReport, Job, Progress, check_targets, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
 from imutool.file_location import local
 from imutool.mcap_io.storage.local import removed_if_empty
@@ -28,7 +28,6 @@ from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
 
 AUTO = "auto"
-SUFFIX = ".mcap"
 
 
 @dataclass
@@ -87,6 +86,8 @@ def convert(
     ways = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
         return _from_stream(module, source, out, sequences, ways, progress)
+    if is_pointer(source):
+        raise nothing_found(source, packed=False)
     found = _find(source, format, Path(out))
     if found.names() and not source.is_dir():
         return _convert_found(found, source, out, sequences, ways, workers, progress)
@@ -97,6 +98,7 @@ def convert(
         if not found.names():
             raise nothing_found(packed.content, packed=packed.root is not None)
         report = _convert_found(found, source, out, sequences, ways, workers, progress)
+        report.losses.extend(pointers_below(packed.content))
     if packed.root is None:
         return report
     names = [name for name in packed.places if name not in found.empty] if source.is_dir() else [source.name]
@@ -125,13 +127,14 @@ def _convert_found(
             for job, target in zip(source_sequences.jobs, targets, strict=True)
         ]
         if len(names) == 1 and source_sequences.errors:
-            raise source_sequences.errors[0][1]
-        _check_targets(jobs, source)
+            raise blamed(source_sequences.errors[0][1], source)
+        check_targets(jobs, source)
         outcomes = run_jobs(jobs, len(names), _worker_count(workers, len(jobs)), progress)
     failed = [(jobs[n].sequence.name, outcome.error) for n, outcome in sorted(outcomes.items()) if outcome.error is not None]
     if len(names) == 1 and failed:
-        raise failed[0][1]
-    report = ConvertReport(failures=[Failure(name, str(error)) for name, error in [*source_sequences.errors, *failed]])
+        raise blamed(failed[0][1], source)
+    errors = ((name, blamed(error, source)) for name, error in [*source_sequences.errors, *failed])
+    report = ConvertReport(failures=[Failure(name, str(error)) for name, error in errors])
     for number, outcome in sorted(outcomes.items()):
         if outcome.error is None:
             report.add(jobs[number].target, outcome)
@@ -237,31 +240,6 @@ def _targets(names: Sequence[str], out: str | Path, *, many: bool) -> list[Path]
     except OSError as error:
         raise ConfigError(f"cannot be made ({error.strerror})", where=folder, expected="a writable place") from error
     return [out / f"{name}{SUFFIX}" if into_folder else out for name in names]
-
-
-def _check_targets(jobs: Sequence[Job], source: Path) -> None:
-    """Refuse to overwrite a log, a source, or another log of the same run."""
-    jobs_by_target: dict[Path, Job] = {}
-    for job in jobs:
-        if (other := jobs_by_target.setdefault(job.target, job)) is not job:
-            what = f"two sequences are named {job.sequence.name}: {other.sequence} and {job.sequence}"
-            raise ConfigError(what, where="source", fix="Convert them one at a time")
-        sources = getattr(job.sequence, "path", None), source if source.is_file() else None
-        if any(path is not None and _is_part_of(job.target, path) for path in sources):
-            raise ConfigError("is the source itself", where=job.target, expected="another `out`")
-        if job.target.exists() and not job.overwrite:
-            raise ConfigError("exists", where=job.target, fix="Choose another `out`, or add `overwrite`")
-
-
-def _is_part_of(target: Path, source: Path) -> bool:
-    """Whether a target is the source or one of its files.
-
-    A log in the source's folder is not one of its files.
-    """
-    if not target.exists():
-        return False
-    inside = source.is_dir() and target.resolve().is_relative_to(source.resolve()) and target.suffix.lower() != SUFFIX
-    return inside or target.samefile(source)
 
 
 def _worker_count(workers: int | None, jobs: int) -> int:

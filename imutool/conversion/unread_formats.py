@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import os
 import re
+from itertools import islice
 from pathlib import Path
 
-from imutool.errors import DataError
+from imutool.errors import DataError, ImutoolError
 from imutool.file_location import compression, first_bytes
 
 ENOUGH = 1024  # bytes of a file's start
 MOST_FILES = 1000  # of a folder, which are looked at
+MOST_NAMED = 3  # pointers
+RECORDINGS = (  # endings of what may be a recording, or a part of one
+    r"\.(bag|db3|mcap|ulg|bin|log|csv|tsv|txt|dat|tum|jsonl?|mat|np[yz]|parquet|feather|arrow|h5|hdf5|xlsx?|zip|tar|gz|xz|bz2|zst)$"
+)
+POINTER, GET_FILES = rb"version https://git-lfs\.github\.com/spec/", "Get the files with git lfs pull, and convert again"
 FORMATS = {  # what a file that begins like this is, and what to do
     rb"H Product:Blackbox": (
         "it is a blackbox log of Betaflight or INAV",
@@ -56,10 +62,7 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "it is a pickle of Python, which can run any program when it is read",
         "Load it where you trust its source, save the arrays with numpy.savez, and convert that",
     ),
-    rb"version https://git-lfs\.github\.com/spec/": (
-        "it is a pointer of Git LFS in place of the file",
-        "Get the files with git lfs pull, and convert again",
-    ),
+    POINTER: ("it is a pointer of Git LFS in place of the file", GET_FILES),
     rb"PK\x03\x04|.{257}ustar": (
         "it is an archive whose name does not end in .zip, .tar, .tar.gz or .tgz",
         "Give it the ending of its kind, or unpack it and convert the folder that is in it",
@@ -87,6 +90,33 @@ def nothing_found(source: Path, *, packed: bool) -> DataError:
         expected="a ROS bag, an MCAP log, a PX4 or ArduPilot log, a table, a mav0 folder or its archive",
         fix=fix,
     )
+
+
+def is_pointer(path: Path) -> bool:
+    """Whether a file is a pointer of Git LFS, whatever its ending."""
+    return path.is_file() and path.stat().st_size <= ENOUGH and re.match(POINTER, first_bytes(path, ENOUGH)) is not None
+
+
+def pointers_below(folder: Path) -> list[str]:
+    """Sentence on the pointers of Git LFS in a folder, which are left out; none without any."""
+    found = [path.name for path in _pointers(folder)]
+    more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
+    said = f"{', '.join(found[:MOST_NAMED])}{more}: pointers of Git LFS in place of the files are left out"
+    return [f"{said}. {GET_FILES}"] if found else []
+
+
+def blamed(error: ImutoolError, source: Path) -> ImutoolError:
+    """The error of a recording, or one that names the pointers of Git LFS of which it consists."""
+    if not isinstance(error, DataError) or not error.where:
+        return error
+    where = Path(error.where)
+    return nothing_found(where, packed=False) if any(path.is_relative_to(where) for path in _pointers(source)) else error
+
+
+def _pointers(folder: Path) -> list[Path]:
+    paths = (Path(inside, name) for inside, _, files in os.walk(folder) for name in sorted(files))
+    recorded = (path for path in paths if re.search(RECORDINGS, path.name.lower()))
+    return [path for path in islice(recorded, MOST_FILES) if is_pointer(path)]
 
 
 def describe_unread(start: bytes) -> tuple[str, str]:

@@ -26,6 +26,7 @@ from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
 
 GROUP = "imutool.converters"
+SUFFIX = ".mcap"
 MAP = "imutool/map"  # record of what a table's columns were taken for
 SAME_COLUMNS = "its columns and units are taken for those of the other tables, which show them"
 ORDER = "quaternion_wxyz"  # entry of that record
@@ -203,3 +204,32 @@ def _run_in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, 
 def convert_numbered(item: tuple[int, Job]) -> Outcome:
     """Convert a job with its number, in a worker process."""
     return _convert_one(item[1])
+
+
+def check_targets(jobs: Sequence[Job], source: Path) -> None:
+    """Refuse to overwrite a log, a source, or another log of the same run.
+
+    Raises:
+        ConfigError: a target is one of these.
+    """
+    jobs_by_target: dict[Path, Job] = {}
+    for job in jobs:
+        if (other := jobs_by_target.setdefault(job.target, job)) is not job:
+            what = f"two sequences are named {job.sequence.name}: {other.sequence} and {job.sequence}"
+            raise ConfigError(what, where="source", fix="Convert them one at a time")
+        sources = getattr(job.sequence, "path", None), source if source.is_file() else None
+        if any(path is not None and _is_part_of(job.target, path) for path in sources):
+            raise ConfigError("is the source itself", where=job.target, expected="another `out`")
+        if job.target.exists() and not job.overwrite:
+            raise ConfigError("exists", where=job.target, fix="Choose another `out`, or add `overwrite`")
+
+
+def _is_part_of(target: Path, source: Path) -> bool:
+    """Whether a target is the source or one of its files.
+
+    A log in the source's folder is not one of its files.
+    """
+    if not target.exists():
+        return False
+    inside = source.is_dir() and target.resolve().is_relative_to(source.resolve()) and target.suffix.lower() != SUFFIX
+    return inside or target.samefile(source)

@@ -141,6 +141,18 @@ def test_of_readings_of_quaternions_that_are_alike_the_positions_show_the_right_
     np.testing.assert_array_equal(found.gyro.axes, PERMUTATIONS[number])
 
 
+@pytest.mark.parametrize("what", MISREAD)
+def test_without_positions_gravity_shows_the_right_one_of_readings_that_are_alike(what: str, flown: tuple[Imu, Truth]) -> None:
+    """Transposed matrices of a motion capture passed for w in the place of z, and --fix turned a world whose z was up."""
+    imu, truth = flown
+    rows, signs = MISREAD[what]
+    misread = np.empty_like(truth.q_wb_wxyz)
+    misread[:, rows] = truth.q_wb_wxyz * signs
+    on_its_back = Imu(imu.t_ns, imu.gyro * [1.0, -1.0, -1.0], imu.accel * [1.0, -1.0, -1.0])
+    found = judge(motion_of(on_its_back), truth._replace(q_wb_wxyz=misread, p_wb=np.zeros_like(truth.p_wb)), 1.0)
+    assert found.quaternions == what
+
+
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
 @pytest.mark.parametrize("step_s", [0.06, 0.5, -0.2])
 def test_a_step_of_one_clock_is_no_delay(share: float, step_s: float, flown: tuple[Imu, Truth]) -> None:

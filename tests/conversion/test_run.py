@@ -362,6 +362,23 @@ def test_recordings_of_one_name_say_which_file_they_are_of(tmp_path: Path) -> No
     assert sorted(path.stem for path in written) == [*expected, "day1_path2_left", "day2_path2_right"]
 
 
+def test_pointers_of_git_lfs_are_named_whatever_reads_such_files(tmp_path: Path) -> None:
+    pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:5f5b\nsize 4\n"
+    (tmp_path / "bag").mkdir()
+    stated = "{version: 5, storage_identifier: sqlite3, relative_file_paths: [a_0.db3], message_count: 4}"
+    (tmp_path / "bag/metadata.yaml").write_text(f"rosbag2_bagfile_information: {stated}\n")
+    for name in ("walk.bag", "walk.zip", "bag/a_0.db3", "gt.csv"):
+        (tmp_path / name).write_bytes(pointer)
+    for name in ("walk.bag", "walk.zip", "bag"):
+        with pytest.raises(DataError, match=r"pointer of Git LFS.*git lfs pull"):
+            convert(tmp_path / name, tmp_path / "out.mcap")
+    (tmp_path / "walk").mkdir()
+    (tmp_path / "gt.csv").rename(tmp_path / "walk/gt.csv")
+    names = ["time_s", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    write_csv(tmp_path / "walk/imu.csv", names, [np.arange(50) / 100, *np.full((5, 50), 0.1), np.full(50, 9.8)])
+    assert "gt.csv: pointers of Git LFS" in convert(tmp_path / "walk", tmp_path / "walk.mcap").losses[0]
+
+
 def test_a_folder_without_a_recording_says_of_which_format_most_of_its_known_files_are(tmp_path: Path) -> None:
     for number in (1, 2, 3):
         (tmp_path / f"imu{number}.mat").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:5f5b\nsize 4\n")

@@ -487,6 +487,32 @@ def test_pairs_that_last_differently_are_recordings_of_their_own(tmp_path):
     assert len(table.read_sequence(together, mapping={"gyro_unit": "rad/s"}).imus) == 2
 
 
+def test_a_gyro_and_an_accelerometer_of_other_times_are_not_paired_row_by_row(tmp_path):
+    for name, first_ms, values in (("Gyroscope", 156_496, GYRO), ("Acceleration", 63_156, ACCEL)):
+        text = "".join(f"{first_ms + 5 * n},{x},{y},{z}\n" for n, (x, y, z) in enumerate(values.tolist()))
+        (tmp_path / f"{name}.csv").write_text(f"Time stamp,x,y,z\n{text}")
+    (sequence,) = table.sequences(tmp_path)
+    with pytest.raises(DataError, match="gyro and accelerometer share no time"):
+        table.read_sequence(sequence, mapping={"time_unit": "ms", "gyro_unit": "rad/s"})
+
+
+def test_axes_in_one_word_are_no_phone_s_and_an_accelerometer_of_its_own_hides_no_imus(tmp_path):
+    pair, rocket = tmp_path / "pair", tmp_path / "rocket"
+    pair.mkdir(), rocket.mkdir()
+    (pair / "Gyroscope.csv").write_text("Time (s),GyroX,GyroY,GyroZ\n" + rows(T_S, GYRO))
+    (pair / "Accelerometer.csv").write_text("Time (s),AccelX,AccelY,AccelZ\n" + rows(T_S, ACCEL))
+    values = np.column_stack([GYRO, ACCEL]).tolist()
+    lines = (f"{t:.3f},IMU{k}," + ",".join(map(repr, row)) for t, row in zip(T_S, values, strict=True) for k in (0, 1))
+    (rocket / "imu_flight.csv").write_text("ts [s],id,Gx,Gy,Gz,Ax,Ay,Az\n" + "\n".join(lines) + "\n")
+    (rocket / "high_g.csv").write_text("ts [s],acc_x,acc_y,acc_z\n" + rows(T_S, ACCEL))
+    for folder, count in ((pair, 1), (rocket, 2)):
+        (sequence,) = table.sequences(folder)
+        imus = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"}).imus
+        assert len(imus) == count
+        for imu in imus.values():
+            np.testing.assert_allclose(imu.gyro, GYRO, rtol=1e-12)
+
+
 def test_a_narrow_table_beside_an_imu_keeps_its_readings(tmp_path):
     t_s, vectors = np.arange(300) / 100.0, np.random.default_rng(5).normal([0, 0, 0, 0, 0, 9.81], 0.1, (300, 6))
     names = ["t [s]", *(f"g{a} [rad/s]" for a in "xyz"), *(f"a{a} [m/s^2]" for a in "xyz")]

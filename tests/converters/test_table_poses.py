@@ -258,6 +258,17 @@ def test_a_map_that_names_rotations_alone_takes_the_time_beside_them(tmp_path):
     np.testing.assert_allclose(poses.p_wb, P_M[::2], atol=1e-8)
 
 
+def test_matrices_on_a_clock_of_their_own_say_so_and_keep_their_positions_where_a_map_names_them(tmp_path):
+    names = [f"Rotation[{n}]" for n in range(9)]
+    header = "Time,Position X [mm],Position Y [mm],Position Z [mm]," + ",".join(names)
+    (tmp_path / "gt.csv").write_text(f"{header}\n" + rows(T_S, 1e3 * P_M, MATRICES.reshape(-1, 9)))
+    (tmp_path / "imu.csv").write_text(imu_text(EPOCH_S))
+    assert "nor do their transposes: their clocks share no time; `rotation_matrix`" in read(tmp_path).remarks.losses[0]
+    stated = {"rotation_matrix": [f"ground_truth/{name}" for name in names]}
+    poses = table.read_sequence(table.sequences(tmp_path)[0], mapping=stated).poses["/ground_truth/pose"]
+    np.testing.assert_allclose(poses.p_wb, P_M, atol=1e-6)
+
+
 def test_a_map_may_name_rotations_where_the_unit_of_the_gyro_is_open(tmp_path):
     bumpy = np.random.default_rng(1).normal(size=ACCEL.shape) * 3.0 + [0.0, 0.0, 9.8]  # gravity does not turn in it
     (tmp_path / "gt.csv").write_text("t,u0,u1,u2,u3\n" + rows(T_S, XYZW))

@@ -216,12 +216,15 @@ def test_a_rate_is_kept_where_the_gyro_is_not_recognised(tmp_path):
     assert "rate_hz = 250.0" in refused.value.fix
 
 
-def test_a_counter_that_begins_again_tells_missing_samples_at_the_rate_above_the_table(tmp_path):
+@pytest.mark.parametrize(
+    "above",
+    ["// Start Time: Unknown\n// Update Rate: 250.0Hz\n", "# Config: data_rate = 250.0 Hz, filter = 488 Hz, range = 4 g\n"],
+)
+def test_a_counter_that_begins_again_tells_missing_samples_at_the_rate_above_the_table(tmp_path, above):
     names = ["PacketCounter", *(f"Acc_{a}" for a in "XYZ"), *(f"Gyr_{a} [rad/s]" for a in "XYZ")]
     received = np.delete(np.arange(COUNT), slice(2000, 2010))
     columns = [(65_000 + received) % 65_536, *ACCEL[received].T, *GYRO[received].T]
-    path = write_csv(tmp_path / "mtw.txt", names, columns, above="// Start Time: Unknown\n// Update Rate: 250.0Hz\n")
-    log = read(path)
+    log = read(write_csv(tmp_path / "mtw.txt", names, columns, above=above))
     assert np.array_equal(log.imus["/imu0"].t_ns, NEXT_NS * received)
     assert log.scalars == {}
 

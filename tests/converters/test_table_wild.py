@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
@@ -139,6 +140,8 @@ def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
         ([f"gyro {a} (in degrees/s)" for a in "xyz"], [f"acc {a} (in m/s^2)" for a in "xyz"]),
         ([f"gyro {a} [degrees per second]" for a in "xyz"], [f"accel_{a}" for a in "xyz"]),
         ([f"ang_vel_{a} [deg/s]" for a in "xyz"], [f"acc_b_{a}" for a in "xyz"]),
+        ([f"G{a}_IMU (deg/s)" for a in "xyz"], [f"A{a}_IMU" for a in "xyz"]),
+        ([f"w.{a} (deg/s)" for a in "xyz"], [f"f.{a}" for a in "xyz"]),  # of structures
         ([f"gyroADC[{k}] (deg/s)" for k in range(3)], [f"accSmooth[{k}] (m/s/s)" for k in range(3)]),  # blackbox_decode
     ],
 )
@@ -202,6 +205,35 @@ def test_the_fields_of_a_microstrain_sensor_have_the_units_of_its_protocol(tmp_p
     imu = read(write_csv(tmp_path / "log.csv", names, columns, above=above)).imus["/imu0"]
     np.testing.assert_array_equal(imu.gyro, gyro)
     np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G)
+
+
+@pytest.mark.parametrize("named", ["rotationRate{}|gravity{}|acceleration{}", "rotationRate.{}|gravity.{}|userAcceleration.{}"])
+def test_gravity_beside_an_acceleration_of_coremotion_is_added_to_it(tmp_path, named):
+    """As Sensor Logger writes the motion of an Apple watch."""
+    t_s, rng = np.arange(1000) * 0.01, np.random.default_rng(4)
+    gravity = -Rotation.from_euler("xyz", 0.8 * np.sin(t_s[:, None] * [0.9, 1.3, 0.7])).inv().apply([0.0, 0.0, 1.0])
+    motion, gyro = rng.normal(0.0, 0.2, (2, 1000, 3))
+    columns = {
+        form.format(axis): each
+        for form, v in zip(named.split("|"), (gyro, gravity, motion), strict=True)
+        for axis, each in zip("XYZ" if "." not in named else "xyz", v.T, strict=True)
+    }
+    path = write_csv(tmp_path / "WristMotion.csv", ["t [s]", *columns], [t_s, *columns.values()])
+    log = table.read_sequence(table.sequences(path)[0], mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_allclose(log.imus["/imu0"].accel, -9.80665 * (gravity + motion), rtol=1e-9)
+    np.testing.assert_array_equal(log.imus["/imu0"].gyro, gyro)
+
+
+def test_short_integers_of_matlab_are_numbers_as_all_are(tmp_path):
+    """A counter in 16 bits named as a time ended in a traceback."""
+    counts = np.round(16384 * ACCEL_G).astype(np.int16)
+    names = [f"accel{axis}Data" for axis in "XYZ"], [f"gyro{axis}Data" for axis in "XYZ"]
+    columns = dict(zip(names[0] + names[1], [*counts.T, *COUNTS.astype(np.int16).T], strict=True))
+    scipy.io.savemat(tmp_path / "run.mat", columns | {"timeData": np.arange(1, COUNT + 1, dtype=np.uint16)})
+    scales = {"accel_unit": "g", "accel_scale": 1 / 16384, "gyro_unit": "deg/s", "rate_hz": 100.0}
+    imu = table.read_sequence(table.sequences(tmp_path / "run.mat")[0], mapping=scales).imus["/imu0"]
+    np.testing.assert_allclose(imu.accel, 9.80665 * counts / 16384, rtol=1e-12)
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(COUNTS), rtol=1e-12)
 
 
 def test_the_scales_of_a_log_of_gyroflow_are_applied(tmp_path):
