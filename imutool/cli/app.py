@@ -23,13 +23,12 @@ from imutool import __version__, registry
 from imutool.cli.overview import ABOUT, show
 from imutool.cli.parameters import FOLDERS, PlainValue, current, error_with_flags, flags, instead_of, with_flags
 from imutool.cli.terminal import log_to_stderr, plain, progress, say, stdout_for_one, tell_error, write_json
-from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact, was_interrupted
+from imutool.errors import INTERRUPTED, PIPE_CLOSED, ConfigError, ImutoolError, redact, was_interrupted
 from imutool.file_location import first_bytes
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.report import Report
 
-PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
 NOTHING_LEFT = "Nothing half-written is left"
 
 
