@@ -233,10 +233,6 @@ class Common:
     verbose: Verbose = False
     quiet: Quiet = False
 
-    def log(self) -> None:
-        """Send log records to stderr."""
-        log_to_stderr(self.verbose, self.quiet)
-
     def progress(self, what: str) -> AbstractContextManager[Callable[[int, int, str], None]]:
         """Progress bar on stderr."""
         return progress(what, self.verbose, self.quiet)
@@ -258,6 +254,7 @@ def expanded(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def command(**words: Any) -> Any:
         common = Common(**{name: words.pop(name) for name in shared})
+        log_to_stderr(common.verbose, common.quiet)
         return function(**words, common=common)
 
     options = [*(option for name, option in own.items() if name != "common"), *shared.values()]
