@@ -74,7 +74,7 @@ def error_map(data: RunData) -> Picture | None:
     rows = len(trace.path)
     starts = np.unique(np.linspace(0, rows - 1, min(rows, MAX_POINTS)).astype(int))
     points = trace.path.p_wb[starts] if fits else data.truth.at(trace.path.t_ns[starts])[0].p_wb
-    whole = ~np.isin(np.arange(len(starts)), np.searchsorted(starts, gap_rows(trace.path)) - 1)  # steps without a gap
+    whole = ~np.isin(np.arange(len(starts)), np.searchsorted(starts, gap_rows(trace.path.t_ns)) - 1)  # steps without a gap
     kinds = {"Position": (trace.errors.position_total_m, "m"), "Orientation": (trace.errors.orientation_total_deg, "°")}
     panels = []
     for kind, (error, unit) in kinds.items():

@@ -198,7 +198,9 @@ def _draw_bias(figure: Any, *, data: RunData, sensor: str) -> None:
         if trace.run.bias_std is not None:
             std = trace.run.bias_std[:, :3] if sensor == "gyro" else trace.run.bias_std[:, 3:]
             _bands(panels, t, bias, SIGMAS * std, color)
-        drawn = [_line(axes, t, bias[:, k], trace.name, k, {"lw": 1.3, **style_of(data, trace)}) for k, axes in enumerate(panels)]
+        drawn = [
+            _line(axes, t, bias[:, k], trace.name, k, {"lw": 1.3, **style_of(data, trace)}) for k, axes in enumerate(panels)
+        ]
         lines.append(drawn[0])
     true = data.true_bias.get(sensor)
     if true is not None:
