@@ -27,6 +27,7 @@ from importlib import import_module
 from typing import Any, ClassVar
 
 INTERRUPTED = 130  # exit code after Ctrl-C
+PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
 LOST = 3  # exit code of work that was done, with something of a log lost or a log quarantined
 # A path keeps one slash of a URL's two. What follows ? or # is a query of http, and of a store if it assigns something
 URL_LOGIN = re.compile(

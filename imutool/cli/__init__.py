@@ -67,6 +67,7 @@ def main() -> None:
         from imutool.errors import was_interrupted
 
         if not was_interrupted(error):
+            _leave_pipe(error)
             raise
         print("error: interrupted. Nothing was begun.", file=sys.stderr)
         sys.exit(INTERRUPTED)
@@ -76,7 +77,16 @@ def main() -> None:
         except SystemExit as end:
             if isinstance(end.__context__, Exit) and was_interrupted(end.__context__):
                 raise KeyboardInterrupt from end  # before the command began or after its end, where typer ends without a word
+            _leave_pipe(end)
             raise
+
+
+def _leave_pipe(error: BaseException) -> None:
+    """End as a program that SIGPIPE ended, where the reader of a help page left: Rich ends with the code of a bug."""
+    from imutool.errors import PIPE_CLOSED
+
+    if isinstance(error.__context__, BrokenPipeError):
+        sys.exit(PIPE_CLOSED)
 
 
 def _unraisable(unraisable: sys.UnraisableHookArgs) -> None:

@@ -23,13 +23,12 @@ from imutool import __version__, registry
 from imutool.cli.overview import ABOUT, show
 from imutool.cli.parameters import FOLDERS, PlainValue, current, error_with_flags, flags, instead_of, with_flags
 from imutool.cli.terminal import log_to_stderr, plain, progress, say, stdout_for_one, tell_error, write_json
-from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact, was_interrupted
+from imutool.errors import INTERRUPTED, PIPE_CLOSED, ConfigError, ImutoolError, redact, was_interrupted
 from imutool.file_location import first_bytes
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.report import Report
 
-PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
 NOTHING_LEFT = "Nothing half-written is left"
 
 
@@ -234,10 +233,6 @@ class Common:
     verbose: Verbose = False
     quiet: Quiet = False
 
-    def log(self) -> None:
-        """Send log records to stderr."""
-        log_to_stderr(self.verbose, self.quiet)
-
     def progress(self, what: str) -> AbstractContextManager[Callable[[int, int, str], None]]:
         """Progress bar on stderr."""
         return progress(what, self.verbose, self.quiet)
@@ -259,6 +254,7 @@ def expanded(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def command(**words: Any) -> Any:
         common = Common(**{name: words.pop(name) for name in shared})
+        log_to_stderr(common.verbose, common.quiet)
         return function(**words, common=common)
 
     options = [*(option for name, option in own.items() if name != "common"), *shared.values()]

@@ -47,7 +47,6 @@ def info(
     """Report the topics, quality and damage of a log; with --noise, also its IMU noise."""
     from imutool.log_info.report import LogInfos
 
-    common.log()
     asked = {"--model": model, "--imu": imu, "--truth": truth, "--noise-plot": noise_plot, "--noise-toml": noise_toml}
     if not noise and (idle := [name for name, value in asked.items() if value is not None]):
         raise ConfigError(f"{idle[0]} needs --noise", where="info", fix="Add --noise")

@@ -63,7 +63,6 @@ def live(
     from imutool.viewing.stream.session import run
     from imutool.viewing.stream.sources import open_source
 
-    common.log()
     malformed = Malformed()
     origin = source or log
     if origin is None or (source and log):

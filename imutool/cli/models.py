@@ -33,7 +33,6 @@ def models(common: Common = COMMON) -> None:
     """List the models that come with imutool: method, sensor, data set and rate."""
     from imutool.bias.model_file import header_of, library
 
-    common.log()
     entries = []
     for path in sorted(library().glob("*.safetensors")):
         about = header_of(path)

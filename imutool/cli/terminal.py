@@ -23,7 +23,7 @@ from imutool.report import Report, json_text
 if TYPE_CHECKING:
     from imutool.training.fit import Epoch
 
-LONGEST = 2000  # letters of an error message
+LONGEST_LINE, LONGEST = 2000, 20_000  # letters of an error message: one with a map to complete has many lines
 LONGEST_ROW = 10_000  # letters of a table's row where nobody looks at a terminal
 NUMBER = re.compile(r"[-+]?[0-9.]+|[–?]")
 MISSING = "–"  # in the place of a figure
@@ -69,10 +69,14 @@ def stdout_for_one(outputs: Mapping[str, Any]) -> AbstractContextManager[Any]:
 
 
 def tell_error(message: str) -> None:
-    """Print a line that begins with "error:" on stderr, and cut a very long text."""
-    if len(message) > LONGEST:
-        message = f"{message[: LONGEST // 2]} … {message[-LONGEST // 2 :]}"
-    say(redact(message), "error", "bold red", to=err)
+    """Print a line that begins with "error:" on stderr, and cut very long lines."""
+    message = "\n".join(_cut(line, LONGEST_LINE) for line in message.split("\n"))
+    say(redact(_cut(message, LONGEST)), "error", "bold red", to=err)
+
+
+def _cut(text: str, longest: int) -> str:
+    """Text without its middle, if it is longer."""
+    return text if len(text) <= longest else f"{text[: longest // 2]} … {text[-longest // 2 :]}"
 
 
 def tell_warning(message: str, word: str = "warning") -> None:

@@ -210,7 +210,7 @@ def _within(progress: Tell | None, done: int, total: int, word: str) -> Callable
 def tabulate(results: Sequence[dict[str, Any]]) -> Iterator[list[tuple[str, ...]]]:
     """Results as tables of text: absolute errors, then relative ones.
 
-    Of a failed run there is nothing to show.
+    Of a failed run there is nothing to show, nor of a path shorter than the distances.
     """
     distances = next((list(result["roe_deg"]) for result in results if not result["failed"]), [])
     keys = ("log", "model", "bias\nstates")
@@ -224,7 +224,7 @@ def tabulate(results: Sequence[dict[str, Any]]) -> Iterator[list[tuple[str, ...]
         absolute.append((*row, *(_number(result[name]) for name in ABSOLUTE), f"{result['cpu_s']:.1f}"))
         relative.append((*row, *(_number(result[name][d]) for name in RELATIVE for d in distances)))
     yield absolute
-    if len(relative) > 1:
+    if any(cell != "–" for row in relative[1:] for cell in row[len(keys) :]):
         yield relative
 
 

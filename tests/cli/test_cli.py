@@ -90,6 +90,13 @@ def test_a_message_of_a_hostile_file_is_cut(capsys: pytest.CaptureFixture[str]) 
     assert said.endswith("xxx). Choose another.\n")
 
 
+def test_a_message_of_many_lines_is_whole(capsys: pytest.CaptureFixture[str]) -> None:
+    """A map to complete was cut in its middle, where its gyro and its units are."""
+    lines = [f'column_{k} = "imu/values[{k}]"' for k in range(200)]
+    tell_error("\n".join(["table.csv: its meaning is not certain", *lines]))
+    assert capsys.readouterr().err.splitlines()[1:] == lines
+
+
 def test_what_several_logs_in_a_row_have_alike_is_printed_once(capsys: pytest.CaptureFixture[str]) -> None:
     with terminal.progress("Reading", verbose=False, quiet=False):
         for log, text in zip("abcda", ("one is lost",) * 3 + ("two are lost",) * 2, strict=True):
@@ -190,12 +197,12 @@ def test_warnings_of_a_log_are_results(tmp_path: Path, imutool: Run) -> None:
     assert re.search(r"^warning: .*\bg\b", imutool("info", "g.mcap", "-q", cwd=tmp_path).stdout, re.MULTILINE)
 
 
-@pytest.mark.parametrize("words", [[], ["--json", "-"]], ids=["table", "json"])
+@pytest.mark.parametrize("words", [["info", "LOG"], ["info", "LOG", "--json", "-"], ["--help"], ["info", "--help"]], ids=" ".join)
 def test_a_reader_that_has_left_is_no_error(logs: Path, command: str, words: list[str]) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     try:
-        line = [command, "info", str(logs / "flight_1.mcap"), *words]
+        line = [command, *(word.replace("LOG", str(logs / "flight_1.mcap")) for word in words)]
         done = subprocess.run(line, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
     finally:
         os.close(writing)

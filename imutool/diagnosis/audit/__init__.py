@@ -20,7 +20,7 @@ from imutool.diagnosis.audit.spectral_lines import SpectralLine, by_differences,
 from imutool.diagnosis.audit.timing import CERTAIN
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.wording.quantity import grouped
-from imutool.errors import ImutoolError
+from imutool.errors import DataError, ImutoolError
 from imutool.file_location import Location
 from imutool.log_info.convention_report import check_poses
 from imutool.noise import datasheet
@@ -69,7 +69,10 @@ def audit(
     check_poses(simulated, world=False)  # of a wrong world the faults say it, and what to do
     recording, real_mount = (None, AT_BODY) if real is None else read_simulation(real, imu=imu, simulated=False)
     sheet = datasheet.read(noise)
-    faults, untold = _faults(simulated, recording, sheet, (mount, real_mount))
+    try:
+        faults, untold = _faults(simulated, recording, sheet, (mount, real_mount))
+    except DataError as error:
+        raise error.at(sim) from error
     not_tested = dict(_not_tested(recording, sheet))
     if untold and not any(fault.fault == "step_lines" for fault in faults):
         at = " and ".join(f"{line.f_hz:.4g} Hz ({line.sensor})" for line in untold)

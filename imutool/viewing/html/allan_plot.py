@@ -12,7 +12,7 @@ from imutool.mcap_io.storage.target import Target
 from imutool.noise import allan
 from imutool.noise_identification import CurveSource, IdentifiedNoise
 from imutool.units import AXES, SENSORS, UNITS, Sensor
-from imutool.viewing.html.drawing import Panel, Picture, legend, plain_tick_labels
+from imutool.viewing.html.drawing import Panel, Picture, decades, legend, plain_tick_labels
 from imutool.viewing.html.drawing import png as drawn
 from imutool.viewing.html.page import AXIS_COLORS, SOFT, TITLES
 
@@ -70,6 +70,7 @@ def _draw(figure: Any, *, source: CurveSource, sensor: Sensor) -> None:
     axes.set_yscale("log")
     if len(curve.tau_s):
         axes.set_ylim(curve.deviation.min() / 3.0, curve.deviation.max() * 2.0)
+        decades(axes)
     axes.set_title(f"{TITLES[sensor]}: {source.how}".replace(", ", ",\n"), fontsize=9)
     axes.set_xlabel("averaging time (s)")
     axes.set_ylabel(f"Allan deviation ({UNITS[sensor]})")

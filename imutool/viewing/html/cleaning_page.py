@@ -13,12 +13,13 @@ from imutool.viewing.html.page import document, text
 
 VERDICTS = {
     "good": "no sample has a fault",
-    "usable": "usable; the clean channel leaves out invalid samples, as listed below",
+    "usable": "usable; the clean channel leaves out the samples listed below as dropped",
     "quarantine": "not trustworthy; it is not cleaned",
 }
 FORCED = "not trustworthy; the clean channel is written because `force` asks for it, and leaves out invalid samples alone"
 COLORS = {"note": "var(--held)", "warning": "var(--mark)", "error": "var(--before)"}
 STRIP = "display: block; width: 100%; min-width: 300px; height: 14px; background: var(--panel)"
+UNITS_OF_NAMES = {"s": "s", "hz": "Hz"}  # by the end of a value's name
 MIN_WIDTH = 0.002  # of the strip, so that one sample in an hour is visible
 
 
@@ -40,7 +41,7 @@ def _imu(survey: Survey) -> Iterator[str]:
     yield from (f"<p>{text(reason)}</p>" for reason in survey.reasons)
     if survey.findings:
         head = "".join(
-            f"<th>{title}</th>" for title in ("Rule", "Count", "What was found", "Action", "Confidence", "Where in the log")
+            f"<th>{title}</th>" for title in ("Rule", "Count", "What was found", "Action", "Confidence", "Where in the log (s)")
         )
         yield f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>'
         yield from (_row(finding, survey) for finding in survey.findings)
@@ -69,12 +70,19 @@ def _row(finding: Finding, survey: Survey) -> str:
 def _as_text(value: Any) -> str:
     """Values as text, numbers to five digits."""
     if isinstance(value, dict):
-        return ", ".join(f"{name.replace('_', ' ')} {_as_text(inner)}" for name, inner in value.items())
+        return ", ".join(map(_named, value.items()))
     if isinstance(value, list | tuple):
         return ", ".join(map(_as_text, value))
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def _named(entry: tuple[str, Any]) -> str:
+    """Name and value, with the unit that ends the name: longest 0.999 s."""
+    name, _, unit = entry[0].rpartition("_")
+    name, unit = (name, UNITS_OF_NAMES[unit]) if name and unit in UNITS_OF_NAMES else (entry[0], "")
+    return f"{name.replace('_', ' ')} {_as_text(entry[1])} {unit}".rstrip()
 
 
 def _strip(finding: Finding, survey: Survey) -> str:
@@ -89,4 +97,4 @@ def _strip(finding: Finding, survey: Survey) -> str:
         width = min(max((last - first) / length, MIN_WIDTH), 1.0 - at)
         marks.append(f'<rect x="{1000 * at:.2f}" width="{1000 * width:.2f}" height="14" fill="{COLORS[finding.severity]}"/>')
     svg = f'<svg viewBox="0 0 1000 14" preserveAspectRatio="none" style="{STRIP}">{"".join(marks)}</svg>'
-    return f'{svg}<div class="note">{when} s</div>'
+    return f'{svg}<div class="note">{when}</div>'

@@ -44,6 +44,7 @@ PICTURES: tuple[Callable[[RunData], Picture | None], ...] = (
     report_errors.event_lanes,
 )
 EVENTS = "events"  # the picture of them
+MAX_COLUMNS = 4  # of a table at half width
 NOTHING: Mapping[str, str] = MappingProxyType({})
 STYLE = """
 h1 { font-size: 22px; color: var(--ink); margin: 0 0 8px; }
@@ -51,10 +52,11 @@ h2.log { font-size: 22px; border-top: 2px solid var(--grid); padding-top: 18px; 
 h3 { font-size: 17px; margin: 30px 0 4px; break-after: avoid; }
 nav { display: flex; flex-wrap: wrap; gap: 4px 16px; font-size: 14px; margin: 10px 0; }
 .pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 440px), 1fr)); gap: 14px 24px; }
-.pair > * { min-width: 0; }
+.pair > * { min-width: 0; } .pair.wide { grid-template-columns: 1fr; }
 .numeric th:not(:first-child), .numeric td:not(:first-child) { text-align: right; }
 .numeric th { white-space: normal; vertical-align: bottom; overflow-wrap: anywhere; }
-.numeric td:first-child { min-width: 130px; } .numeric .word { text-align: left !important; }
+.numeric td:first-child { min-width: 130px; } @media screen { .numeric th:not(:first-child) { min-width: 5.5em; } }
+ .numeric .word { text-align: left !important; }
 @media screen and (min-width: 900px) { .numeric td:first-child { white-space: nowrap; } }
 td.best { font-weight: 700; color: var(--after); }
 summary { cursor: pointer; font-size: 15px; padding: 8px 0; color: var(--soft); }
@@ -169,7 +171,8 @@ def _log(data: RunData, key: str, drawn: Mapping[str, str], *, alone: bool) -> I
     links = [("figures", "Figures")] * bool(data.table()) + list(entries.items()) + [("provenance", "Provenance")]
     yield f'<nav aria-label="Parts of the report about {text(data.name)}">'
     yield "".join(f'<a href="#{key}-{name}">{text(title)}</a>' for name, title in links) + "</nav>"
-    yield f'<div class="pair">{"".join((*_figures(data, key), *_windows(data)))}</div>'
+    width = "pair wide" if len(data.traces) > MAX_COLUMNS else "pair"
+    yield f'<div class="{width}">{"".join((*_figures(data, key), *_windows(data)))}</div>'
     yield from (f'<p class="note">{text(note)}</p>' for note in (*data.notes, *report_signals.missing_pictures()))
     if not alone:
         yield "<details><summary>Pictures, events and provenance</summary>"

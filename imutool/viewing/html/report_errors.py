@@ -11,7 +11,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.viewing.html.drawing import Panel, Picture, at_least_three_ticks, legend, plain_tick_labels
 from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, text
-from imutool.viewing.html.report_paths import color_of
+from imutool.viewing.html.report_paths import style_of
 from imutool.viewing.html.report_wording import alignment_text, format_number, format_quantity
 from imutool.viewing.model.decimation import DecimatedLine, decimate_extremes
 from imutool.viewing.model.events import KINDS, Event
@@ -110,9 +110,8 @@ def _draw(
                 continue
             shown = np.where(error > 0.0, error, np.nan) if log else error  # the start is exact: log(0)
             label = f"{trace.name}: {title.lower()}, {name}" if axes is not panels[0] else trace.name
-            line = axes.plot(
-                *decimate_extremes(t, shown), color=color_of(data, trace), lw=0.9 if trace.is_raw else 1.3, label=label
-            )
+            style = style_of(data, trace)
+            line = axes.plot(*decimate_extremes(t, shown), lw=0.9 if trace.is_raw else 1.3, label=label, **style)
             lines += line if axes is panels[0] else []
         _limits(axes, values, signed=signed, log=log)
         if beyond:
@@ -178,8 +177,8 @@ def event_lanes(data: RunData) -> Picture | None:
 
 
 def event_table(data: RunData) -> Iterator[str]:
-    """Table of the first events of each kind by time, with the number of the others."""
-    shown = sorted(_first(data.events), key=lambda event: event.start_ns)
+    """Table of the longest events of each kind by time, with the number of the others."""
+    shown = sorted(_longest(data.events), key=lambda event: event.start_ns)
     yield '<div class="scroll"><table><thead><tr><th>From (s)</th><th>For</th><th>What</th><th></th></tr></thead><tbody>'
     for event in shown:
         start_s, seconds = (event.start_ns - data.start_ns) * 1e-9, (event.end_ns - event.start_ns) * 1e-9
@@ -190,7 +189,7 @@ def event_table(data: RunData) -> Iterator[str]:
         )
     yield "</tbody></table></div>"
     if len(shown) < len(data.events):
-        yield f'<p class="note">{len(data.events) - len(shown):,} more are drawn above but not listed.</p>'
+        yield f'<p class="note">The longest of each kind; {len(data.events) - len(shown):,} more are drawn above.</p>'
 
 
 def event_label(kind: str) -> str:
@@ -198,11 +197,12 @@ def event_label(kind: str) -> str:
     return {"worst": "worst error"}.get(kind, kind.replace("_", " "))
 
 
-def _first(events: Sequence[Event]) -> list[Event]:
-    """First events of every kind, the same number of each."""
+def _longest(events: Sequence[Event]) -> list[Event]:
+    """Longest events of every kind, the same number of each; of equal length the first."""
     kinds = {event.kind for event in events}
     share = max(1, MAX_ROWS // max(len(kinds), 1))
-    return [event for kind in kinds for event in [other for other in events if other.kind == kind][:share]]
+    by_length = sorted(events, key=lambda event: event.start_ns - event.end_ns)
+    return [event for kind in kinds for event in [other for other in by_length if other.kind == kind][:share]]
 
 
 def _draw_lanes(figure: Any, *, data: RunData, kinds: Sequence[str]) -> None:

@@ -21,6 +21,7 @@ MAX_POINTS = 1500  # of a path
 FAR = 3.0  # extents of the truth; a path beyond leaves the picture
 MARGIN = 0.06
 ASPECT = 1.25  # width over height of a panel
+DASHES: tuple[Any, ...] = ("-", (0, (7, 1.5, 1, 1.5)), (0, (1, 1)))  # of four models, of the next four, of the next
 KILOMETRES_M = 5000.0  # extent from which axes are in kilometres
 MIN_EXTENT_M = 0.5  # of a picture: a log at rest is not magnified to millimetres
 
@@ -30,6 +31,12 @@ Points = Float64[np.ndarray, "_ 3"]
 def color_of(data: RunData, trace: Trace) -> str:
     """Colour of a run in every picture."""
     return BEFORE if trace.is_raw else MODELS[data.models().index(trace) % len(MODELS)]
+
+
+def style_of(data: RunData, trace: Trace) -> dict[str, Any]:
+    """Colour and dashes of a run's curves: no two runs of twelve share both."""
+    rank = 0 if trace.is_raw else data.models().index(trace)
+    return {"color": color_of(data, trace), "ls": DASHES[rank // len(MODELS) % len(DASHES)]}
 
 
 def paths(data: RunData) -> Picture | None:
@@ -67,7 +74,7 @@ def error_map(data: RunData) -> Picture | None:
     rows = len(trace.path)
     starts = np.unique(np.linspace(0, rows - 1, min(rows, MAX_POINTS)).astype(int))
     points = trace.path.p_wb[starts] if fits else data.truth.at(trace.path.t_ns[starts])[0].p_wb
-    whole = ~np.isin(np.arange(len(starts)), np.searchsorted(starts, gap_rows(trace.path)) - 1)  # steps without a gap
+    whole = ~np.isin(np.arange(len(starts)), np.searchsorted(starts, gap_rows(trace.path.t_ns)) - 1)  # steps without a gap
     kinds = {"Position": (trace.errors.position_total_m, "m"), "Orientation": (trace.errors.orientation_total_deg, "°")}
     panels = []
     for kind, (error, unit) in kinds.items():
@@ -87,7 +94,7 @@ def _draw_paths(figure: Any, *, data: RunData, shown: Sequence[Trace], axes_of: 
     scale, unit = _unit_of(_extent(box))
     lines = []
     for trace in data.traces:
-        style = {"lw": 0.9 if trace.is_raw else 1.3, "color": color_of(data, trace), "label": trace.name}
+        style = {"lw": 0.9 if trace.is_raw else 1.3, "label": trace.name, **style_of(data, trace)}
         lines += axes.plot(*(_broken(trace.path)[:, sides] * scale).T, **style)
     if data.truth is not None:
         true = axes.plot(*(_broken(data.truth)[:, sides] * scale).T, lw=1.1, color=INK, ls=(0, (4, 2)), label="truth")

@@ -17,7 +17,7 @@ from imutool.recording import Imu
 from imutool.units import AXES, SENSORS, UNITS, Sensor
 from imutool.viewing.html.drawing import Panel, Picture, at_least_three_ticks, decades, legend, plain_tick_labels
 from imutool.viewing.html.page import AXIS_COLORS, INK, SOFT, TITLES
-from imutool.viewing.html.report_paths import color_of
+from imutool.viewing.html.report_paths import color_of, style_of
 from imutool.viewing.html.report_wording import best_run, format_number, run_name, worst_orientation_error
 from imutool.viewing.model.decimation import average_log_bins, decimate_extremes
 from imutool.viewing.model.run_data import Run, RunData, Spectrum, Trace, round_up_125, spectra
@@ -71,16 +71,16 @@ def biases(data: RunData) -> Picture | None:
 def spectrum(data: RunData) -> Picture | None:
     """Amplitude density of the samples up to half their rate; None for a short log."""
     data = data.integrated()
-    if not any(trace.spectra for trace in data.traces):
-        return None
     curves = {
         sensor: [
             (trace, spectrum.frequency_hz, spectrum.density)
             for trace in data.traces
-            if (spectrum := trace.spectra.get(sensor)) is not None
+            if (spectrum := trace.spectra.get(sensor)) is not None and spectrum.density.any()  # a constant has none
         ]
         for sensor in SENSORS
     }
+    if not any(curves.values()):
+        return None
     subtracted = [(trace, _subtracted(trace.run)) for trace in data.models()]
     panels = [
         Panel(
@@ -172,7 +172,7 @@ def _draw_samples(figure: Any, *, data: RunData, sensor: str, span_s: tuple[floa
         values = getattr(trace.run.imu, sensor)[part]
         if rank == 0 and len(data.traces) > 1:
             steps = _steps(values)
-        style: dict[str, Any] = {"color": color_of(data, trace), "lw": 0.8}
+        style = {"lw": 0.8, **style_of(data, trace)}
         drawn = [_line(axes, t[part], values[:, k] - rank * steps[k], trace.name, k, style) for k, axes in enumerate(panels)]
         lines.append(drawn[0])
     for axes, step in zip(panels, steps, strict=True):
@@ -198,7 +198,9 @@ def _draw_bias(figure: Any, *, data: RunData, sensor: str) -> None:
         if trace.run.bias_std is not None:
             std = trace.run.bias_std[:, :3] if sensor == "gyro" else trace.run.bias_std[:, 3:]
             _bands(panels, t, bias, SIGMAS * std, color)
-        drawn = [_line(axes, t, bias[:, k], trace.name, k, {"color": color, "lw": 1.3}) for k, axes in enumerate(panels)]
+        drawn = [
+            _line(axes, t, bias[:, k], trace.name, k, {"lw": 1.3, **style_of(data, trace)}) for k, axes in enumerate(panels)
+        ]
         lines.append(drawn[0])
     true = data.true_bias.get(sensor)
     if true is not None:
@@ -270,7 +272,7 @@ def _log_line(axes: Any, x: Any, y: Any, data: RunData, trace: Trace, axis: int)
     name = trace.name if axis == 0 else f"{trace.name}, {AXES[axis]}"
     shown = np.where(y > 0.0, y, np.nan)  # a constant has no spectrum
     under = trace.is_raw and bool(data.models())
-    style: dict[str, Any] = {"color": color_of(data, trace), "lw": 1.8 if under else 1.0, "alpha": 0.55 if under else 1.0}
+    style = {"lw": 1.8 if under else 1.0, "alpha": 0.55 if under else 1.0, **style_of(data, trace)}
     return axes.plot(x, shown, label=name, **style)[0]
 
 

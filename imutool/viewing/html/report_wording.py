@@ -84,7 +84,7 @@ def conclusion(data: RunData) -> str:
     if chosen is None:
         return _without_truth(data)
     if chosen.is_raw or before is None:
-        seconds = format_number(data.duration_s)
+        seconds = format_number(chosen.figures["duration_s"])
         text = f"{run_name(chosen)} has errors of {_errors(chosen)} over {seconds} s{start_text(chosen)}, without alignment"
     else:
         seconds = format_number(chosen.figures["duration_s"])

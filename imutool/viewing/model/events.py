@@ -59,7 +59,7 @@ def survey_events(survey: Survey) -> tuple[list[Event], list[str]]:
             length = f" for {(end_ns - start_ns) * 1e-9:.3g} s" if end_ns > start_ns else ""
             events.append(Event(kind, start_ns, end_ns, f"{finding.what}{length} ({finding.count} in the log)"))
         if finding.intervals_left_out:
-            notes.append(f"{finding.intervals_left_out} more intervals of {finding.what} are not listed as events.")
+            notes.append(f"{finding.intervals_left_out} later intervals of {finding.what} are not listed as events.")
     return events, notes
 
 

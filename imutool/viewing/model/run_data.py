@@ -21,6 +21,7 @@ from imutool.geometry import quaternion
 from imutool.inertial.aids import Aids
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Poses, Scalars, Times, nanoseconds, seconds
+from imutool.recording.columns import quantile
 from imutool.viewing.model.events import Event
 from imutool.viewing.model.trajectory_error import Alignment, Drift, Errors, Window
 
@@ -186,16 +187,17 @@ def level_start(imu: Imu) -> StartPose:
     return StartPose(level.as_quat(scalar_first=True), np.zeros(3), np.zeros(3))
 
 
-def gap_rows(poses: Poses) -> Int64[np.ndarray, " m"]:
+def gap_rows(t_ns: Times) -> Int64[np.ndarray, " m"]:
     """Rows that follow a gap, as `Poses.at` defines it."""
-    if len(poses) < 2:
+    if len(t_ns) < 2:
         return np.zeros(0, np.int64)
-    return np.flatnonzero(np.diff(poses.t_ns) > nanoseconds(max(GAP_FACTOR * poses.period_s, MIN_GAP_S))) + 1
+    step_ns = np.diff(t_ns)
+    return np.flatnonzero(step_ns > max(GAP_FACTOR * float(quantile(step_ns, 0.5)), nanoseconds(MIN_GAP_S))) + 1
 
 
 def split_at_gaps(poses: Poses) -> list[Poses]:
     """Split poses at their gaps, so that no line crosses one."""
-    edges = [0, *gap_rows(poses).tolist(), len(poses)]
+    edges = [0, *gap_rows(poses.t_ns).tolist(), len(poses)]
     return [poses.rows(slice(first, last)) for first, last in pairwise(edges)]
 
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 
@@ -108,7 +109,7 @@ class Live:
         """Write everything to `temporary` too, which will become `path`."""
         self._file = new_stream(self._name)
         self._file.save(temporary)
-        self.shown.append(Output("rrd", str(path), f"{self.trouble}Saved {path}. Open with: rerun {path}"))
+        self.shown.append(Output("rrd", str(path), f"{self.trouble}Saved {path}. Open with: rerun {quote(str(path))}"))
 
     def __call__(self, block: DebiasedBlock) -> None:
         """Show a block; after an error, warn once and stop the live view."""

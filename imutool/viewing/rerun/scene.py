@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 
 from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.storage.target import Target
@@ -50,7 +51,7 @@ def save(logs: Sequence[RunData], path: Path | None = None, *, source: bool = Tr
         refuse_existing(target, overwrite=overwrite, choose="Give another name as `save`")
     with Target(target, overwrite=overwrite) as file:  # refuses before the work is done, leaves nothing after a failure
         file.write(rrd(logs, source=source))
-    return Output("rrd", str(target), f"Saved {target}. Open with: rerun {target}")
+    return Output("rrd", str(target), f"Saved {target}. Open with: rerun {quote(str(target))}")
 
 
 def rrd(logs: Sequence[RunData], *, source: bool = True) -> bytes:

@@ -182,6 +182,10 @@ def test_poses_too_slow_to_show_a_line_leave_its_cause_open(tmp_path: Path) -> N
     assert report.faults == ()
     assert "Hz (accel)" in report.not_tested["step_lines"]
     assert "step_lines" not in report.tested
+    slower = Poses(slow.t_ns[::6], slow.p_wb[::6], slow.q_wb_wxyz[::6])
+    write(replace(sim, truths={"/ground_truth/pose": slower}), tmp_path / "slower.mcap")
+    with pytest.raises(DataError, match=r"slower\.mcap: no stretch of the"):
+        audit(tmp_path / "slower.mcap")
 
 
 @pytest.mark.parametrize(

@@ -181,7 +181,20 @@ def test_events_have_lanes_and_rows_and_of_many_the_rest_is_counted(seen: RunDat
         said = Page(report.page([replace(seen, events=(*seen.events, *many))])).text
     listed = len(re.findall(r"\bstop \d+\b", said))
     assert 0 < listed < 90
-    assert f"{90 - listed} more are drawn above but not listed" in said
+    assert f"{90 - listed} more are drawn above" in said
+
+
+def test_of_many_events_the_longest_are_listed(seen: RunData) -> None:
+    """The gap of a second of a log with many short ones was not in the table."""
+    times = [(seen.start_ns + k * 10**8, 10**8 if k == 89 else 0) for k in range(90)]
+    data = replace(seen, events=tuple(Event("gap", at, at + length, f"gap {k}") for k, (at, length) in enumerate(times)))
+    assert "gap 89" in "".join(report_errors.event_table(data))
+
+
+def test_no_two_of_many_models_look_alike(seen: RunData) -> None:
+    models = [replace(seen.traces[1], run=replace(seen.traces[1].run, name=f"model {k}")) for k in range(11)]
+    data = replace(seen, traces=(seen.traces[0], *models))
+    assert len({tuple(report_paths.style_of(data, trace).values()) for trace in data.traces}) == 12
 
 
 def test_what_was_drawn_before_the_last_events_were_known_is_not_drawn_again(
@@ -430,7 +443,9 @@ def test_without_truth_there_are_no_errors_and_it_is_said(flown: Recording) -> N
 def test_a_sensor_that_reads_zero_is_drawn(flown: Recording) -> None:
     zeros = np.zeros_like(flown.imu.gyro)
     dead = replace(flown, imu=Imu(flown.imu.t_ns, zeros, zeros))
-    assert not re.search(r"\bnan\b", Page(report.page([build(dead, [Run.raw(dead.imu)])])).text, re.IGNORECASE)
+    data = build(dead, [Run.raw(dead.imu)])
+    assert not re.search(r"\bnan\b", Page(report.page([data])).text, re.IGNORECASE)
+    assert report_signals.spectrum(data) is None  # its panels were empty
 
 
 @pytest.mark.usefixtures("words_alone")
@@ -446,9 +461,10 @@ def test_a_bare_log_has_no_empty_section(flown: Recording) -> None:
 @pytest.mark.usefixtures("words_alone")
 def test_truth_without_a_model_is_scored_alone(seen: RunData) -> None:
     with drawing_only(report_signals.biases, report_signals.zoom):
-        content = report.page([replace(seen, traces=seen.traces[:1])])
+        raw = replace(seen.traces[0], figures={**seen.traces[0].figures, "duration_s": 12.5})  # a log may go on after its truth
+        content = report.page([replace(seen, traces=(raw,))])
     assert titles(content) == ["Figures", "Drift from a true start", "Provenance"]
-    assert "raw has errors of" in Page(content).text
+    assert re.search(r"raw has errors of .* over 12\.5 s", Page(content).text)
     assert 'class="number best"' not in content  # there is nothing to choose from
 
 

@@ -417,6 +417,16 @@ def test_a_name_is_shortened_by_the_words_that_all_models_begin_with(data: RunDa
 # ── what is not there ──
 
 
+def test_no_line_crosses_a_gap_of_the_samples(recording: Recording, tmp_path: Path) -> None:
+    """Rerun drew a straight one over a second without samples; a row of NaN in its middle breaks it."""
+    kept = ~np.isin(np.arange(len(recording.imu)), np.arange(400, 600))
+    cut = replace(recording, imu=recording.imu.rows(kept), truths={}, scalars={})
+    found = saved_rrd.read(saved_rrd.written([build(cut, [Run.raw(cut.imu)])], tmp_path / "gap.rrd"))
+    values = found["/imu/gyro/raw"].numbers(SCALARS)
+    assert np.isnan(values[400]).all()
+    np.testing.assert_array_equal(np.delete(values, 400, axis=0), cut.imu.gyro)
+
+
 def test_what_is_unknown_is_left_out(recording: Recording, runs: list[Run], tmp_path: Path) -> None:
     short = recording.between(int(recording.imu.t_ns[0]), int(recording.imu.t_ns[40]))  # too short for a spectrum
     data = replace(build(replace(short, truths={}, scalars={}), [Run.raw(short.imu)]), events=())

@@ -10,7 +10,7 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.recording import Times
 from imutool.units import AXES, SENSORS
-from imutool.viewing.model.run_data import MAX_CURVE_ROWS, RunData, Trace, curve_rows
+from imutool.viewing.model.run_data import MAX_CURVE_ROWS, RunData, Trace, curve_rows, gap_rows
 from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.entities import styles
 from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, GRID, INK, RAW_FADE, XYZ, axis_colors, blend_to_grey
@@ -86,11 +86,16 @@ def log_curves(
     *,
     max_rows: int | None = None,
 ) -> None:
-    """Log one curve per column after its style, decimated to `max_rows` (MAX_DERIVED_ROWS)."""
+    """Log one curve per column after its style, decimated to `max_rows` (MAX_DERIVED_ROWS).
+
+    A row of NaN in the middle of a gap breaks the line: Rerun's straight one would pass for samples.
+    """
     to.log(entity, style, static=True, strict=True)
-    rows = curve_rows(values, MAX_DERIVED_ROWS if max_rows is None else max_rows)
+    rows, gaps = curve_rows(values, MAX_DERIVED_ROWS if max_rows is None else max_rows), gap_rows(t_ns)
+    middle_ns, at = t_ns[gaps - 1] + (t_ns[gaps] - t_ns[gaps - 1]) // 2, np.searchsorted(rows, gaps)
+    t_ns, values = np.insert(t_ns[rows], at, middle_ns), np.insert(values[rows], at, np.nan, axis=0)
     # strict: Rerun only warns of a length that does not match, and then the rows are missing
-    to.send_columns(entity, sdk.data_times(data, t_ns[rows]), rr.Scalars.columns(scalars=values[rows]), strict=True)
+    to.send_columns(entity, sdk.data_times(data, t_ns), rr.Scalars.columns(scalars=values), strict=True)
 
 
 def decimation_note(data: RunData) -> list[str]:
