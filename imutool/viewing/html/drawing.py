@@ -38,6 +38,7 @@ STYLE = {
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,  # no label is above the axes: to find that out takes a twentieth of a drawing
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
