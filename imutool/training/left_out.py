@@ -86,6 +86,17 @@ DECISIVE = {
     for sensor, criteria in CRITERIA.items()
 }
 
+WITHOUT_TRAINING = {
+    "raw": (
+        "the raw samples",
+        "imutool info LOG says what may be wrong with the poses, or the motion does not show the sensor",
+    ),
+    "static": (
+        "samples without their bias at rest",
+        "imutool evaluate LOG --model MODEL --model static compares both on a log",
+    ),
+}
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -149,7 +160,19 @@ def compare(
         logger.warning("%s", contradiction)
     parts = len(logs) > len(recordings)
     kept = {sensor: best_predicted(fit, sensor, candidates) if parts else keep(scores, sensor) for sensor, fit in fits.items()}
+    for warning in better_without(scores, kept["gyro"]):
+        logger.warning("%s", warning)
     return Comparison(tuple(scores), kept, parts, contradictions)
+
+
+def better_without(scores: Sequence[Score], kept: str) -> Iterator[str]:
+    """Warnings of raw samples or a bias at rest whose orientation errors are smaller than those of the candidate kept."""
+    logs, aoe = list(dict.fromkeys(score.log for score in scores)), DECISIVE["gyro"][0]
+    errors = {model: _log_errors(scores, logs, model, aoe) for model in (kept, *WITHOUT_TRAINING)}
+    for model, (name, fix) in WITHOUT_TRAINING.items():
+        if beaten(errors[kept], errors[model]):
+            less = 1.0 - np.exp(-np.nanmean(errors[kept] - errors[model]))
+            yield f"on the left-out logs {name} have {100.0 * less:.0f} % less error of orientation than the model: {fix}"
 
 
 def keep(scores: Sequence[Score], sensor: Sensor) -> str:

@@ -17,7 +17,7 @@ from imutool.evaluation import evaluate
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.training.calibration.effect_selection import LINEAR, calibrate
-from imutool.training.left_out import Score, beaten, keep
+from imutool.training.left_out import Score, beaten, better_without, keep
 from imutool.training.log_agreement import Contradiction, check_axes, contradicting
 from imutool.training.run import train
 from imutool.training.settings import settings_of
@@ -72,6 +72,16 @@ def test_the_simplest_candidate_that_is_not_beaten_is_kept() -> None:
     assert keep(scores(constant=constant, linear=[0.5, 4.0, 0.7, 2.5]), "gyro") == "constant", "the logs do not agree"
     assert keep(scores(constant=constant, linear=better, static=[0.3] * 4), "gyro") == "constant", "static beats both"
     assert keep(scores(constant=constant, linear=better, static=[0.3] * 4), "accel") == "linear"
+
+
+def test_logs_that_are_better_without_the_model_are_told() -> None:
+    model, worse = [1.0, 2.0, 1.5, 1.2], [1.2, 2.1, 1.9, 1.2]
+    half = [0.5 * error for error in model]
+    assert not [*better_without(scores(raw=worse, static=worse, constant=model), "constant")]
+    (told,) = better_without(scores(raw=half, static=worse, constant=model, linear=half), "constant")
+    assert told.startswith("on the left-out logs the raw samples have 50 % less error of orientation than the model: ")
+    (told,) = better_without(scores(raw=worse, static=half, constant=model), "constant")
+    assert "bias at rest" in told
 
 
 def test_a_candidate_that_is_worse_from_one_start_is_not_kept() -> None:
