@@ -23,7 +23,7 @@ from imutool.training.calibration.normal_equations import TINY, Seen, Terms, lin
 from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 
-WEIGHT_PRIOR = 0.3  # of a weight, in the unit of the curve: chosen by left-out training logs of FETCH
+WEIGHT_PRIOR = 2.4  # of a weight, over the root of their number, in the unit of the curve: chosen by left-out logs of FETCH
 
 
 @torch.no_grad()
@@ -47,7 +47,7 @@ def solve_last_layer(model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float
             gyro[rows] -= model.sensor_bias("gyro", whole)[0]
     values = torch.cat([pool.of_sensor(sensor), torch.cat(inputs)], dim=1)
     width = values.shape[1]
-    std = torch.full((3, width), WEIGHT_PRIOR).to(values)
+    std = torch.full((3, width), WEIGHT_PRIOR / (width - 3) ** 0.5).to(values)
     std[:, :3] = W_PRIOR
     by_axis = torch.eye(3 * width).to(values).reshape(3, width, 3 * width)
     problem = linearise(Seen(pool, sensor, gyro), Terms(values, by_axis, std.flatten() ** -2.0), "train")
