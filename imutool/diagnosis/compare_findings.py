@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.observability import exclude_each_other, values_of
 from imutool.diagnosis.estimation.trial.selection import Selection
@@ -54,6 +55,12 @@ def is_of_digits(finding: Finding, digits: Finding) -> bool:
         return False
     removed = finding.held_out.rms_before**2 - finding.held_out.rms_after**2
     return removed < (1.0 if is_term else NAMED_SHARE) * lsb.value**2 / 12.0
+
+
+def is_of_simulation(digits: Finding, pairs: Sequence[Pair]) -> bool:
+    """Whether the simulation has the digits of the recording, too: they set neither apart."""
+    lsb = {f"{name}_lsb": float(np.median([pair.sim_lsb[part] for pair in pairs])) for name, part in IMU_SIGNALS.items()}
+    return all(abs(lsb[name] - own.value) <= ALIKE_SHARE * own.value for name, own in digits.parameters.items())
 
 
 def remarks(findings: Sequence[Finding], sim_findings: Sequence[Finding]) -> Iterator[str]:

@@ -248,7 +248,7 @@ def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile
             raise DataError("its poses cover too little of the recording", where=sim.name)
         covered.append(WhitenedImu(pair, log.whiten))
         before.append(with_constant(pair, given))
-        after.append(with_constant(pair, simulated))
+        after.append(with_constant(pair, given + simulated - plain))  # what a curve through poses misses is no physics
         _refuse_unlike(covered[-1], before[-1], with_constant(pair, plain), sim)
     return {
         signal: msgspec.structs.replace(one, by="second simulation") for signal, one in gains(covered, before, after).items()

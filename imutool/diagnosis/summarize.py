@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.diagnosis.compare_findings import contradictions, is_of_digits, remarks, shared
+from imutool.diagnosis.compare_findings import contradictions, is_of_digits, is_of_simulation, remarks, shared
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, without_effects
@@ -66,7 +66,8 @@ def summarize(
     digits = timestamps.rounded(pairs, sample)  # are a sample's, and a row beside poses is the mean of many
     selection, named, idle = _worthwhile(logs, selection, noise, digits)
     after = [with_effects(pair, selection.fitted.chosen) for pair in pairs]  # held-out time stays unseen
-    all_findings = [*named, *timestamps.saturated(pairs, after, selection.tried), *timestamps.dropped(pairs), *digits]
+    all_findings = [*named, *timestamps.saturated(pairs, after, selection.tried), *timestamps.dropped(pairs)]
+    all_findings += [one for one in digits if not is_of_simulation(one, pairs)]
     if not exact:
         all_findings += late_stamps(pairs) + vibration_above_band(logs, selection.whole.chosen)
     elif not any(finding.effect in RESONANT for finding in all_findings):

@@ -137,7 +137,7 @@ class Pair(AlignedLog):
 
     `sim_noise` was filtered out of a simulation's samples but for `noise_left` (zero where its poses replace them), `truth` are
     the true poses at the stamps, and `poses_hz` is the rate at which they were recorded. `batched_s` is the deviation of the
-    log's stamps from `stamp_s`, if they came in batches.
+    log's stamps from `stamp_s`, if they came in batches. `sim_lsb` are the digits of the simulation (zero: none).
     """
 
     ideal: IdealMotion = field(kw_only=True)
@@ -145,6 +145,7 @@ class Pair(AlignedLog):
     poses_hz: float = field(default=0.0, kw_only=True)
     batched_s: float = field(default=0.0, kw_only=True)
     sim_noise: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6), kw_only=True)
+    sim_lsb: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6), kw_only=True)
     channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING, kw_only=True)
 
     @property

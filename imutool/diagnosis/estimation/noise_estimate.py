@@ -38,7 +38,7 @@ def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -
     """Whitened log with its noise model; beside poses also with the band that they know."""
     if pair.exact:
         residual, rate_hz = _left(pair, candidates), 1.0 / pair.period_s
-        return _counting(pair, level(residual, pair.usable, rate_hz, pair.settings.noise, pair.noise_left))
+        return _counting(pair, level(residual, pair.usable, rate_hz, pair.settings.noise, pair.noise_left, pair.sim_lsb))
     assert pair.band_hz is not None
     ideal, works = expected(pair, ()), pair.axes
     band_hz = known_band_hz(pair.real[:, works], ideal[:, works], 1.0 / pair.period_s, pair.band_hz, settings)

@@ -169,8 +169,7 @@ def _simulated(
     """Simulated motion without noise on an even clock, the noise that was filtered out, and what is left of it."""
     samples = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1)
     noise = white_noise(samples)
-    shared = np.isin(sim.imu.t_ns, real.imu.t_ns).mean() > KNOWN_SHARE  # what jitters in both logs alike sets neither apart
-    t_sim = t_sim if shared else without_jitter(t_sim, samples, settings.timestamps)
+    t_sim = without_jitter(t_sim, samples, settings.timestamps)
     period_s = float(np.median(np.diff(t_sim)))
     of_real = white_noise(np.concatenate([real.imu.gyro, real.imu.accel], axis=1)), len(real.imu)
     ideal = _by_poses(sim, samples, noise, 1.0 / period_s, of_real, settings)

@@ -210,15 +210,15 @@ def level(
     rate_hz: float,
     settings: NoiseSettings,
     left: NoiseLeft | None = None,
+    lsb: Float64[np.ndarray, " k"] | float = 0.0,
 ) -> Whitener:
     """Whitening filters of a sensor beside an exact simulation, or above the band of its poses.
 
     As `whitener`, but below `motion_hz` the noise is taken to be what it is above, and what is `left` of a simulation's own.
-
-    What is left down there may be physics that nobody thought of, and must not be taken for noise.
+    What is left down there may be physics that nobody thought of. No noise is less than LSB² / 12 of a simulation's digits.
     """
-    filters, std = np.zeros((residual.shape[1], settings.order + 1)), np.ones(residual.shape[1])
-    filters[:, 0] = 1.0
+    filters, std = np.eye(1, settings.order + 1).repeat(residual.shape[1], axis=0), np.ones(residual.shape[1])
+    least = np.broadcast_to(np.square(lsb) / (6.0 * rate_hz), std.shape)
     for axis, counts in enumerate(_by_axis(usable, residual.shape[1])):
         if not counts.any():
             continue
@@ -228,7 +228,7 @@ def level(
         power[f_hz < low] = np.median(power[(f_hz >= low) & (f_hz <= high)])
         if left is not None:
             power[f_hz < low] += np.interp(f_hz[f_hz < low], left.f_hz, left.density[:, axis])
-        filters[axis], std[axis] = autoregression(power, rate_hz, settings.order)
+        filters[axis], std[axis] = autoregression(np.maximum(power, least[axis]), rate_hz, settings.order)
     return Whitener(filters, std)
 
 

@@ -15,7 +15,14 @@ from imutool.diagnosis.estimation.gauss_newton import Fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.time_alignment import same_motion, with_simulation
 from imutool.diagnosis.reference.own_poses import align_with_poses, band_hz
-from imutool.diagnosis.reference.taken_samples import batch_remark, filled, new_samples, on_own_clock, repeats
+from imutool.diagnosis.reference.taken_samples import (
+    batch_remark,
+    filled,
+    new_samples,
+    on_own_clock,
+    repeats,
+    without_common_jitter,
+)
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut, Located
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings, ReferenceSettings
 from imutool.diagnosis.wording.quantity import percent
@@ -153,9 +160,12 @@ def _compared(recordings: Sequence[Recording], settings: AlignmentSettings) -> I
 def align(real: Recording, sim: Recording | None, truth: str | None, settings: DiagnoseSettings) -> Iterator[Pair]:
     """Intervals of the recording that the simulation or its own poses cover without a hole."""
     real, batched_s = on_own_clock(new_samples(real))
-    sim = None if sim is None else new_samples(sim)
+    if sim is not None:
+        real, sim = without_common_jitter(real, new_samples(sim), settings.timestamps)
+    columns = () if sim is None else (*sim.imu.gyro.T, *sim.imu.accel.T)
+    lsb = np.array([timestamps.grid(column, settings.timestamps) for column in columns] or [0.0] * 6)
     for pair in _aligned(real, sim, truth, settings):
-        yield replace(pair, batched_s=batched_s)
+        yield replace(pair, batched_s=batched_s, sim_lsb=lsb)
 
 
 def _aligned(real: Recording, sim: Recording | None, truth: str | None, settings: DiagnoseSettings) -> Iterator[Pair]:

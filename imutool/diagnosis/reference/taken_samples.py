@@ -10,8 +10,11 @@ import numpy as np
 from imutool.array_types import Bool, Float64
 from imutool.cleaning.stamp_line import batch_words, read_stamps, restamped
 from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.timestamps import even
 from imutool.diagnosis.result import Estimate, Finding, HeldOut
-from imutool.recording import Recording
+from imutool.diagnosis.settings import TimestampSettings
+from imutool.inertial.stationary import white_noise
+from imutool.recording import Recording, seconds
 from imutool.recording.columns import true_ranges
 
 SELDOM = 0.1  # of the samples of an axis that are equal to the one before: digits are finer than the noise
@@ -19,6 +22,7 @@ MOSTLY_NEW = 0.3  # of the samples that repeat the one before: more is a topic t
 LEAST_NEW = 0.05  # of the samples with news of both sensors: two that take turns have none
 STRAIGHT = 1e-3  # of the median change of the slope, up to which three samples are on a line: float32 rounds far less
 STUCK = 10  # samples in a row that a sensor stands still, and is not held
+MOSTLY_COMMON, OWN_NOISE = 0.5, 0.1  # of the stamps of a simulation; of the noise, that two logs of one sample differ by
 JITTER = "timestamp_jitter"
 
 
@@ -78,6 +82,28 @@ def on_own_clock(recording: Recording) -> tuple[Recording, float]:
         return recording, 0.0
     own_ns = restamped(t_ns)
     return replace(recording, imu=replace(recording.imu, t_ns=own_ns)), float((t_ns - own_ns).std()) * 1e-9
+
+
+def without_common_jitter(real: Recording, sim: Recording, settings: TimestampSettings) -> tuple[Recording, Recording]:
+    """Both on an even clock, if the simulation has the recording's stamps and noise: it was made from its samples.
+
+    What wanders in both alike sets neither apart, and no spline has to pass through noise between two stamps.
+    """
+    t_ns, *rows = np.intersect1d(real.imu.t_ns, sim.imu.t_ns, return_indices=True)
+    if len(t_ns) <= MOSTLY_COMMON * len(sim.imu):
+        return real, sim
+    read, simulated = (
+        np.concatenate([imu.gyro, imu.accel], axis=1)[row] for imu, row in zip((real.imu, sim.imu), rows, strict=True)
+    )
+    if not (white_noise(read - simulated) < OWN_NOISE * white_noise(read)).any():
+        return real, sim
+    since_s, start_ns = seconds(t_ns, int(t_ns[0])), int(t_ns[0])
+    late_s = since_s - even(since_s, settings)[0]
+    imus = [
+        replace(imu, t_ns=imu.t_ns - np.round(1e9 * np.interp(seconds(imu.t_ns, start_ns), since_s, late_s)).astype(np.int64))
+        for imu in (real.imu, sim.imu)
+    ]
+    return replace(real, imu=imus[0]), replace(sim, imu=imus[1])
 
 
 def batched(pairs: Sequence[Pair], others: Sequence[Finding]) -> list[Finding]:

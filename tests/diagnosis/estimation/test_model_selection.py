@@ -24,7 +24,7 @@ from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.observability import with_plainer_effects
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.estimation.trial import verdicts
-from imutool.diagnosis.estimation.trial.lag_start import with_delay_of_accel
+from imutool.diagnosis.estimation.trial.lag_start import with_delay_of_accel, with_filter_of_each_sensor
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
 from imutool.diagnosis.settings import SearchSettings
@@ -721,6 +721,17 @@ def test_each_sensor_has_its_own_filter(
     for sensor, (_, theta) in (("gyro", of_gyro), ("accel", of_accel)):
         (one,) = (one for one in selection.selected if one.effect.sensors == (sensor,))
         assert one.theta[0] == pytest.approx(theta[0], abs=SURE * one.std[0])
+
+
+def test_a_gyro_is_not_ahead_of_a_slow_accelerometer_but_the_clock_is() -> None:
+    """Of slow motion a faster filter beside a gyro that looks ahead leaves as little, and no filter looks ahead."""
+    felt, slow = trembling(8.0), ("second_order_low_pass", [20.0, 0.7])
+    logs = [planted.weighed(through(felt, ("clock_skew", [0.0]), slow, -0.004))]
+    delay, filtered = ([of for of in planted.catalogue() if of.key == key] for key in ("gyro_delay", f"{slow[0]}:accel"))
+    wrong = fit(logs, ((delay[0], np.array([-0.004])), (filtered[0], np.array([33.0, 0.7]))))
+    found = with_filter_of_each_sensor(logs, wrong, planted.catalogue())
+    assert {effect.key for effect, _ in found.chosen} == {"clock_offset", filtered[0].key}
+    assert found.chosen[0][1] == pytest.approx([0.004], abs=3e-4)
 
 
 def test_a_filter_of_each_sensor_that_shows_its_lag_alone_has_no_order_by_chance() -> None:

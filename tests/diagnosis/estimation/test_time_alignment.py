@@ -236,15 +236,6 @@ def test_clocks_of_one_epoch_are_left_alone_so_that_an_offset_between_them_shows
     assert later.aligned_s == 0.0
 
 
-def test_jitter_that_both_logs_have_sets_neither_apart() -> None:
-    """A recording with an effect added to it, beside the recording itself: its clock was corrected in one of the two."""
-    real, _ = logs()
-    t_ns = real.imu.t_ns + np.round(np.random.default_rng(1).normal(0.0, 3e5, len(real.imu))).astype(np.int64)
-    jittery = replace(real, imu=replace(real.imu, t_ns=t_ns))
-    (pair,) = with_simulation(jittery, jittery)
-    assert (left(pair)[:, :3].std(axis=0) < 0.2 * planted.NOISE[:3]).all()
-
-
 @pytest.mark.parametrize("away_ns", [0, YEAR_NS])
 def test_at_rest_a_bias_that_drifts_is_no_motion(away_ns: int) -> None:
     t_s = planted.clock()

@@ -12,8 +12,11 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from imutool.cleaning.rules.axes import TO_Z_UP
-from imutool.diagnosis.diagnose import diagnose
+from imutool.diagnosis.compare_findings import is_of_simulation
+from imutool.diagnosis.diagnose import candidates_for, diagnose
+from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.reference.conventions import with_common_conventions
 from imutool.diagnosis.reference.coverage import align, align_all
 from imutool.diagnosis.reference.taken_samples import batched, filled, new_samples, repeats
@@ -186,6 +189,23 @@ def test_units_are_told_beside_the_poses_of_the_recording_too() -> None:
         ("wrong_unit", "accel = 0.101972 accel of the poses"),
     ]
     assert np.abs(after.real - expected(after, ())).max() < 1.0
+
+
+def test_a_simulation_that_is_the_recording_itself_differs_by_what_was_added_to_it_alone() -> None:
+    """Its digits and the jitter of its stamps set neither apart, though no noise hides them."""
+    real = made(EXACT)
+    imu, lsb = along(real, 1).imu, 1e-3
+    t_ns = imu.t_ns + np.round(np.random.default_rng(1).normal(0.0, 3e5, len(imu))).astype(np.int64)
+    sim = replace(real, truths={}, imu=Imu(t_ns, lsb * np.round(imu.gyro / lsb), lsb * np.round(imu.accel / lsb)))
+    (pair,), _ = align_all([replace(sim, imu=replace(sim.imu, gyro=1.01 * sim.imu.gyro))], sim, None, DiagnoseSettings())
+    model = expected(pair, ())
+    assert np.abs(pair.real[:, :3] / 1.01 - model[:, :3]).max() < 1e-6
+    assert np.abs(pair.real[:, 3:] - model[:, 3:]).max() < 1e-6
+    (digits,) = timestamps.rounded([pair], np.zeros(6))
+    assert is_of_simulation(digits, [pair])
+    assert not is_of_simulation(digits, [replace(pair, sim_lsb=pair.sim_lsb / 2.0)])
+    white = whitened(pair, candidates_for([pair]), DiagnoseSettings().band).whiten
+    assert white.std == pytest.approx(lsb / np.sqrt(12.0), rel=0.2)
 
 
 @pytest.mark.parametrize("with_simulation", [True, False])

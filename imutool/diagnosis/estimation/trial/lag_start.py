@@ -137,19 +137,24 @@ def with_filter_of_each_sensor(logs: Sequence[WhitenedLog], now: Fit, named: Seq
         return now
     others, period_s = tuple(entry for k, entry in enumerate(now.chosen) if k not in lags), logs[0].pair.period_s
     lag_s: dict[tuple[str, ...], float] = {(sensor,): sum(_lag_s(*now.chosen[k], sensor) for k in lags) for sensor in SENSORS}
-    second = [of for of in named if of.name == LOW_PASSES[1] and lag_s.get(of.sensors, 0.0) > LEAST_LAG * period_s]
-    if not second or min(lag_s.values()) < -LEAST_LAG * period_s:
+    clocks, early_s = [of for of in named if of.name == "clock_offset"], min(0.0, *lag_s.values())
+    early_s = early_s if early_s < -LEAST_LAG * period_s else 0.0  # no filter is ahead, but a clock may be
+    late = [sensors for sensors, own_s in lag_s.items() if own_s - early_s > LEAST_LAG * period_s]
+    second = [of for of in named if of.name == LOW_PASSES[1] and of.sensors in late]
+    if not second or (early_s and not clocks):
         return now
 
     def beside(shared_s: float, *clock: tuple[Effect, Theta]) -> Fit:
         each = ((of, np.array([_cutoff_hz(of, [BUTTERWORTH], lag_s[of.sensors] - shared_s), BUTTERWORTH])) for of in second)
         return fit(logs, (*others, *clock, *each), near=now)
 
-    best = beside(0.0)
+    best = beside(early_s, *((of, np.array([-early_s])) for of in clocks if early_s))
     for of in second:
         best = _with_own_form(logs, best, of.sensors, named)
+    if early_s:
+        return best if _form_bic(best) < _form_bic(now) + logs[0].pair.settings.search.clearly_better else now
     shared_s = CLOCKS_SHARE * min(lag_s.values())  # of the lag of both may be the clock's
-    offsets = [beside(shared_s, (of, np.array([-shared_s]))) for of in named if of.name == "clock_offset" and len(second) > 1]
+    offsets = [beside(shared_s, (of, np.array([-shared_s]))) for of in clocks if len(second) > 1]
     best = min((best, *offsets), key=_form_bic)
     if len(best.prior) < len(now.prior):  # simpler
         return best if _form_bic(best) < _form_bic(now) else now
