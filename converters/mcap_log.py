@@ -62,7 +62,9 @@ def as_defined(topic: MessageTopic) -> MessageTopic:
 
 
 def read_sequence(sequence: Sequence, *, images: bool = True, define: Define = as_defined) -> MessageLog:
-    """Message log of an MCAP log, or of the parts of one; `define` gives topics the definitions that it lacks.
+    """Message log of an MCAP log, or of the parts of one.
+
+    `define` gives topics the definitions that it lacks.
 
     Raises:
         DataError: the log is damaged.
@@ -187,7 +189,10 @@ def _ends_whole(file: BinaryIO) -> bool:
 def read_parts(
     sequence: Sequence, paths: list[Path], remarks: Remarks, *, images: bool = True, define: Define = as_defined
 ) -> MessageLog:
-    """Message log of the parts of a ROS 2 bag, one after the other; an unfinished one is read up to its end."""
+    """Message log of the parts of a ROS 2 bag, one after the other.
+
+    An unfinished one is read up to its end.
+    """
     counts = Counter[str]()
     topics: dict[str, MessageTopic] = {}
     metadata: dict[str, dict[str, str]] = {}

@@ -44,7 +44,7 @@ class MessageBlock:
     length: int
     end: int  # behind the message indexes that follow a chunk
     start_ns: int
-    end_ns: int
+    end_ns: int  # 0 of a chunk whose writer never set it
     compression: str | None  # None: a run outside chunks
     indexes: dict[int, int] = field(default_factory=dict)  # channel id to the offset of its MessageIndex record
     counts: dict[int, int] | None = None  # messages per channel id, once known

@@ -212,7 +212,7 @@ class _Rewrite:
             return
         if self.index.definitions_known and block.indexes and self.imu_channels.isdisjoint(block.indexes):
             head, indexes = read_message_indexes(self.source, block)
-            if indexes is not None:
+            if indexes is not None and head[:2] == (indexes.start_ns, indexes.end_ns):
                 self._list_chunk(block, head, indexes, self.passing.defer(block.end))
                 return
         self._copy_unpacked(block)

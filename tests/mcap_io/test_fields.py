@@ -23,6 +23,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.fields import numeric_fields, others, read_field
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.repair import repair
 
 START_NS = 1_700_000_000_123_456_789
 PERIOD_NS = 20_000_000
@@ -278,6 +279,7 @@ def test_two_layouts_of_an_imu_s_messages_are_never_mistaken_for_one(tmp_path: P
         writer.finish()
     with pytest.raises(LogError, match="two definitions of a/msg/RawImu are on /imu"):
         Log(tmp_path / "merged.mcap")
+    assert repair(tmp_path / "merged.mcap", tmp_path / "saved.mcap").messages == {"/imu": 2}
 
 
 def raw(path: Path, definition: bytes, payload: bytes, *, name: str = "a/msg/A", language: str = "ros2msg") -> Path:

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.opcode import Opcode
 from support import log_damage
@@ -116,6 +117,9 @@ def test_times_of_a_chunk_that_are_not_those_of_its_messages_are_set_right(log: 
     raw = raw.replace(struct.pack("<QQ", block.start_ns, block.end_ns), bytes(16))  # in the chunk and in the summary
     crc = zlib.crc32(raw[summary:-12])
     log.write_bytes(raw[:-12] + crc.to_bytes(4, "little") + MAGIC)
+    with Log(log) as wrong:
+        times = [rows.log_time for _, rows in wrong.rows(wrong.topics, block.start_ns, block.end_ns)]
+        assert np.concatenate(times).size == sum(block.start_ns <= m[1] <= block.end_ns for m in by_mcap(log))
     found, report = saved(log)
     assert found == Counter(by_mcap(log))
     assert report.losses.harmless == [f"the times of the chunk at byte {block.offset} are not those of its messages"]
