@@ -28,9 +28,9 @@ UNIT_BAND = 0.02  # of the length of a gravity in g
 
 
 def add_gravity(columns: Columns) -> None:
-    """Add the specific force to a table of CoreMotion: its acceleration is without gravity, which has columns of its own.
+    """Add the specific force to a table of CoreMotion, whose acceleration has no gravity.
 
-    Both read -1 g along the axis that points up.
+    Gravity has columns of its own. Both read -1 g along the axis that points up.
     """
     names = {split_name(column)[0]: column for column in columns.values}
     rate, gravity, motion = (axes_of(form, names, "xyz") for form in CORE_MOTION.values())
