@@ -211,8 +211,9 @@ def test_the_fields_of_a_microstrain_sensor_have_the_units_of_its_protocol(tmp_p
 def test_gravity_beside_an_acceleration_of_coremotion_is_added_to_it(tmp_path, named):
     """As Sensor Logger writes the motion of an Apple watch."""
     t_s, rng = np.arange(1000) * 0.01, np.random.default_rng(4)
-    gravity = -Rotation.from_euler("xyz", 0.8 * np.sin(t_s[:, None] * [0.9, 1.3, 0.7])).inv().apply([0.0, 0.0, 1.0])
-    motion, gyro = rng.normal(0.0, 0.2, (2, 1000, 3))
+    angles = np.stack([2.0 * t_s, 0.8 * np.sin(1.3 * t_s), 1.1 * t_s], axis=1)  # turns over and over
+    gravity = -Rotation.from_euler("xyz", angles).inv().apply([0.0, 0.0, 1.0])
+    motion, gyro = rng.normal(0.0, 0.9, (2, 1000, 3))
     columns = {
         form.format(axis): each
         for form, v in zip(named.split("|"), (gyro, gravity, motion), strict=True)
