@@ -502,6 +502,17 @@ def test_readings_in_several_states_are_asked_unless_one_has_none(tmp_path):
                 read(path)
 
 
+@pytest.mark.parametrize(
+    ("gyro", "accel", "sizes"), [("mrad/s", "mm/s^2", (1e-3, 1e-3)), ("deg/h", "µg", (np.pi / 180.0 / 3600.0, 9.80665e-6))]
+)
+def test_small_units_in_a_header_are_multiplied(tmp_path, gyro, accel, sizes):
+    names = ["time [s]", *(f"gyro_{a} [{gyro}]" for a in "xyz"), *(f"acc_{a} [{accel}]" for a in "xyz")]
+    rates, forces = 0.01 * COUNTS, 9.80665 * ACCEL_G
+    imu = read(write_csv(tmp_path / "imu.csv", names, [T_S, *(rates / sizes[0]).T, *(forces / sizes[1]).T])).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, rates, rtol=1e-9)
+    np.testing.assert_allclose(imu.accel, forces, rtol=1e-9)
+
+
 def test_multiples_of_a_unit_in_a_header_are_applied_and_ranges_are_not(tmp_path):
     names = ["time (ms)", *(f"gyroscope {a} (0.1 deg/s)" for a in "xyz"), *(f"accelerometer {a} (1e-3 g)" for a in "xyz")]
     path = write_csv(tmp_path / "imu.csv", names, [1e3 * T_S, *COUNTS.T, *(1e3 * ACCEL_G).T])
