@@ -177,7 +177,7 @@ def unit_named(text: str) -> str:
 
 
 def unit_with_factor(column: str, beside: str) -> tuple[float, str]:
-    """Factor and unit that a column or its unit states, `(0.1 deg/s)` or `[mrad/s]`; else 1 and no unit."""
+    """Factor and unit that a column states, `(0.1 deg/s)` or `[mrad/s]`; else 1 and no unit."""
     inside = re.search(r"[\[(]([^\])]*)[\])]\s*$", column)
     text = (inside[1] if inside else beside).strip().lower()
     if found := next((multiple for named, multiple in MULTIPLES.items() if re.fullmatch(named, text)), None):
