@@ -165,7 +165,8 @@ def _propose_time_unit(proposal: Proposal, column: str, names: dict[str, tuple[s
         return
     if len(certain) == 1:
         proposal.entries["time_unit"] = certain[0]
-        proposal.reasons.append(f"{column!r} counts {certain[0]}: {1e9 / (step * TIME_NS[certain[0]]):.1f} samples a second")
+        what = "rows" if in_batches(values) else "samples"  # which may repeat one another
+        proposal.reasons.append(f"{column!r} counts {certain[0]}: {1e9 / (step * TIME_NS[certain[0]]):.1f} {what} a second")
     else:
         proposal.open.append("time_unit")
         proposal.reasons.append(f"{column!r} states no unit, and a step of {step:.4g} fits {' and '.join(certain) or 'none'}")

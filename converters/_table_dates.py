@@ -33,6 +33,8 @@ DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset;
     r" ?(?P<half>[AP]M)? ?(?P<zone>Z|UTC|[+-]\d\d(:?\d\d)?)?",
     re.IGNORECASE,
 )
+MONTHS = "jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"
+NAMED = re.compile(rf"(\d\d?)[- ]({'|'.join(MONTHS)})[- ](\d{{4}})(?=[ T])", re.IGNORECASE)  # 21-Nov-2026 15:04:05, of MATLAB
 CLOCK = re.compile(  # of one day or, as Excel shows times, of one hour; 15:04:05:123 ends with milliseconds
     r"(?:(\d\d?):)?(\d\d?):(\d\d)(?:(?:[.,]|(?<=:\d\d:\d\d):(?=\d{3}$))(\d{1,9})\d*)?"
 )
@@ -43,6 +45,8 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
 
     Clocks without a date count from the first midnight. Of 4/5/2026 the month is the first number, unless one exceeds 12 there.
     """
+    if texts and NAMED.match(texts[0]):
+        texts = [NAMED.sub(lambda m: f"{m[3]}-{MONTHS.index(m[2].lower()) + 1}-{m[1]}", text) for text in texts]
     matches = [DATE.fullmatch(text) for text in texts]
     slashes = [match for match in matches if match and match["sign"] == "/"]
     day_first = any(int(match["first"]) > 12 for match in slashes)

@@ -84,6 +84,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     time, unit = str(entries["time"]), str(entries["time_unit"])
     other = time_beside(columns, columns.unsigned(entries["accel"][0]), time, unit, apart=True)
     found: Entries = {"accel_time": other[0]} if other is not None and other[1] == unit else {}
+    found |= _position_beside(columns, entries)
     groups: dict[tuple[tuple[str, str], bool], dict[str, str]] = {}
     for column, values in columns.values.items():
         in_rows = (time, unit) if len(values) == len(columns.values[time]) else None
@@ -137,7 +138,7 @@ def turned(columns: Columns, entries: Entries) -> Entries:
     return entries | (found | {"truth_time": clock[0], "truth_time_unit": clock[1]} if found else {})
 
 
-def position_beside(columns: Columns, entries: Entries) -> Entries:
+def _position_beside(columns: Columns, entries: Entries) -> Entries:
     """Entries of the positions x, y, z in the table of poses of which a map names the rotations alone."""
     named = next((each for name in TURNS if (each := entries.get(name))), "")
     group = group_of(columns.unsigned(matrix_columns(named)[0])) if named and "truth_file" not in entries else ""

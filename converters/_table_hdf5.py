@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,16 @@ import numpy as np
 from imutool.errors import DataError, required
 
 from ._table_mat import check_size
+from ._table_names import unit_named
 from ._table_text import Columns
+from ._table_units import TIME_NS
 
 MOST_CELLS = 10_000  # of a cell array
 FILLS = "_FillValue", "missing_value"  # attributes that say what stands for a missing value
+SINCE = re.compile(  # of the CF conventions, in UTC
+    r"(?P<unit>[a-z]+) since (?P<day>\d{4}-\d\d?-\d\d?)([T ]+(?P<clock>\d\d?:\d\d?:\d\d?)(\.0*)?)? *(Z|UTC|[+-]?0?0(:?00)?)?",
+    re.IGNORECASE,
+)
 DEEPEST = 8  # groups below a cell: one may lead to itself
 
 
@@ -86,7 +93,9 @@ def _add_node(columns: Columns, name: str, node: Any, path: Path) -> None:
         columns.add(name, np.array([_word(row) for row in node[()].T]))
     else:
         unit = next((value for key, value in node.attrs.items() if key.lower() in ("unit", "units")), "")
-        columns.add(name, _measured(node), _plain(unit))
+        values = _measured(node)
+        since_1970_ns = _since_1970(values, _plain(unit))
+        columns.add(name, *((values, _plain(unit)) if since_1970_ns is None else (since_1970_ns, "ns")))
 
 
 def _measured(node: Any) -> Any:
@@ -99,6 +108,21 @@ def _measured(node: Any) -> Any:
     if {"scale_factor", "add_offset"} & stated.keys():
         values = values * float(stated.get("scale_factor", 1.0)) + float(stated.get("add_offset", 0.0))
     return values
+
+
+def _since_1970(values: np.ndarray, unit: str) -> np.ndarray | None:
+    """Nanoseconds since 1970 of times whose unit is that of NetCDF, `seconds since 2026-11-21 15:04:05`; None for others."""
+    match = SINCE.fullmatch(unit.strip())
+    size = TIME_NS.get(unit_named(match["unit"]), 0.0) if match else 0.0
+    if match is None or not size or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        return None
+    day, clock = ([int(part) for part in re.findall(r"\d+", match[each] or "0:0:0")] for each in ("day", "clock"))
+    try:
+        start = np.datetime64("{:04d}-{:02d}-{:02d}T{:02d}:{:02d}:{:02d}".format(*day, *clock), "ns")
+    except ValueError:
+        return None
+    steps = values * int(size) if values.dtype.kind in "iu" else np.rint(values * size)
+    return np.asarray(steps.astype(np.int64) + start.astype(np.int64))
 
 
 def _add_cells(columns: Columns, name: str, node: Any, path: Path) -> None:

@@ -19,6 +19,7 @@ from ._table_units import ACCEL_SI, GYRO_SI, STANDARD_GRAVITY, TIME_NS, gravity_
 LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
 STEADY_BAND = 0.3  # share by which the steady part of the acceleration may differ from gravity
 NO_GRAVITY = r"(user|free)_?acc"  # in names of accelerations without gravity
+WITH_GRAVITY = r"(^|_)(raw|specific_?force)(_|$)"
 CORE_MOTION = {  # names of `CMDeviceMotion` on iOS and watchOS, as several programs write them
     "rotation rate": r"(.*_)?rotation_?rate_?(?P<axis>[xyz])",
     "gravity": r"(.*_)?(motion_?)?gravity_?(?P<axis>[xyz])",
@@ -28,9 +29,9 @@ UNIT_BAND = 0.02  # of the length of a gravity in g
 
 
 def add_gravity(columns: Columns) -> None:
-    """Add the specific force to a table of CoreMotion: its acceleration is without gravity, which has columns of its own.
+    """Add the specific force to a table of CoreMotion, whose acceleration has no gravity.
 
-    Both read -1 g along the axis that points up.
+    Gravity has columns of its own. Both read -1 g along the axis that points up.
     """
     names = {split_name(column)[0]: column for column in columns.values}
     rate, gravity, motion = (axes_of(form, names, "xyz") for form in CORE_MOTION.values())
@@ -40,10 +41,13 @@ def add_gravity(columns: Columns) -> None:
     length = np.linalg.norm(values[np.isfinite(values).all(axis=1)], axis=1)
     if not len(length) or np.abs(np.quantile(length, [0.05, 0.95]) - 1.0).max() > UNIT_BAND:
         return
-    for axis, each in zip("xyz", -(values + columns.side_by_side(motion)).T, strict=True):
-        columns.values[f"accelerometer_{axis} [g]"] = each
+    force = -(values + columns.side_by_side(motion))
+    for axis, each, own in zip("xyz", force.T, motion, strict=True):
+        columns.values[f"specific_force_{axis} [g]"] = each
+        if not re.search(NO_GRAVITY, spaced_name(own)):  # no second accelerometer
+            columns.values[f"user_{own}"] = columns.values.pop(own)
     said = f"{motion[0]}/y/z and {gravity[0]}/y/z are of CoreMotion, which takes gravity out and reads -1 g upwards"
-    columns.remarks.notes.append(f"{said}: the accelerometer is minus their sum")
+    columns.remarks.notes.append(f"{said}: the specific force is minus their sum")
 
 
 def doubt_gravity(proposal: Proposal, columns: Columns) -> None:
@@ -57,7 +61,7 @@ def doubt_gravity(proposal: Proposal, columns: Columns) -> None:
         proposal.reasons.append(f"{said}, and by its name gravity was taken out")
     elif level * ACCEL_SI[unit] < LEAST_GRAVITY:
         proposal.reasons.append(f"{said}, much less than gravity: it was taken out, or the unit is another")
-    elif is_motion_alone(columns, chosen) and not re.search(r"(^|_)raw(_|$)", name) and not _keeps_gravity(proposal, columns):
+    elif is_motion_alone(columns, chosen) and not re.search(WITH_GRAVITY, name) and not _keeps_gravity(proposal, columns):
         why = "it often is much smaller, and all cancel out"
         proposal.reasons.append(f"{said}, {why}: gravity was taken out, or the body turned upside down and back")
     else:

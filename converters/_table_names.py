@@ -33,6 +33,12 @@ UNITS = {
     "cm": r"cm|centimet(er|re)s?",
     "mm": r"mm|millimet(er|re)s?",
 }
+MULTIPLES = {  # of a unit, by their names
+    r"mrads?( ?/ ?s(ec)?)|milliradians?( ?/ ?| per )s(ec(ond)?)?": (1e-3, "rad/s"),
+    r"(deg(ree)?s?|°)( ?/ ?| per )h(r|our)?": (1.0 / 3600.0, "deg/s"),
+    r"mm/s((\^|\*\*)?2|²)": (1e-3, "m/s^2"),
+    r"[uµμ]g|micro-?gs?": (1e-6, "g"),
+}
 RATE_OR_FORCE_UNITS = (
     r"m?dps|(?:deg|rad)(?:_?(?:per_?)?s(?:ec(?:ond)?)?|ps)|mps2|ms2|mss|(?:m|ft)_(?:per_)?s_?2|mg|milli_?gs?"  # in a name
 )
@@ -171,8 +177,11 @@ def unit_named(text: str) -> str:
 
 
 def unit_with_factor(column: str, beside: str) -> tuple[float, str]:
-    """Factor and unit that a column or its unit states, `(0.1 deg/s)`; else 1 and no unit."""
+    """Factor and unit that a column states, `(0.1 deg/s)` or `[mrad/s]`; else 1 and no unit."""
     inside = re.search(r"[\[(]([^\])]*)[\])]\s*$", column)
+    text = (inside[1] if inside else beside).strip().lower()
+    if found := next((multiple for named, multiple in MULTIPLES.items() if re.fullmatch(named, text)), None):
+        return found
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?(?:[eE]-?\d+)?)\s*[*·x]?\s*(\D.*)", inside[1] if inside else beside)
     unit = unit_named(match[2].strip()) if match else ""
     return (float(match[1]), unit) if match and unit else (1.0, "")

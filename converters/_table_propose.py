@@ -25,6 +25,7 @@ from ._table_names import (
     triples,
 )
 from ._table_text import Columns
+from ._table_times import usual_step
 from ._table_units import (
     ACCEL_SI,
     GYRO_SI,
@@ -38,6 +39,7 @@ from ._table_units import (
 RANGES = 250, 500, 1000, 2000  # deg/s, of InvenSense's gyros
 NEAR_FEET = 0.05  # share by which an acceleration may differ from gravity in ft/s^2, as one of 3.3 g in m/s^2 does
 LEAST_COUNTS = 50.0  # of gravity in whole numbers
+LONGEST_STEP_NS = 5e8  # of increments
 MOST_SHOWN = 12  # triples of columns in a message
 NOTHING: Entries = {}
 
@@ -213,7 +215,10 @@ def _propose_increments(proposal: Proposal, columns: Columns) -> None:
     if not known or "accel_unit" not in proposal.open:
         return
     t, unit = columns.values[str(proposal.entries["time"])].astype(float), str(proposal.entries["time_unit"])
-    rate_hz = float(f"{1e9 / (np.nanmedian(np.diff(t)) * TIME_NS[unit]):.5g}")
+    step_ns = usual_step(t) * TIME_NS[unit]
+    if not 0.0 < step_ns < LONGEST_STEP_NS:  # of a second, an increment of velocity is as large as the acceleration
+        return
+    rate_hz = float(f"{1e9 / step_ns:.5g}")
     if "m/s^2" in gravity_units(columns, proposal.unsigned("accel", columns), rate_hz)[1]:
         proposal.reasons.append(f"times the {rate_hz:g} samples a second, the accel is gravity: it seems to hold increments")
         proposal.hints += [

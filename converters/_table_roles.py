@@ -64,6 +64,7 @@ def role_groups(tables: Names) -> dict[Path, str]:
     if of_sensors:
         return of_sensors | {path: TRUTH_GROUP for path in true if len(true) == 1 and path not in of_sensors}
     shown = [path for path in tables if seen[path].is_imu and path not in true]
+    shown = [path for path in shown if not re.fullmatch(REFERENCE, words[path])] or shown  # whose rates are no sensor's
     imus = [path for path in tables if re.fullmatch(IMU, words[path]) and path not in true] or shown
     poses = true or [path for path in tables if seen[path].has_poses and path not in shown]
     if not poses and len(imus) == len(shown) == 1 and any(seen[path].has_time for path in tables if path not in shown):

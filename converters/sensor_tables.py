@@ -115,7 +115,7 @@ def read(source: Path) -> Iterator[MessageLog]:
 
 
 def is_phone(path: Path, inside: str = "") -> bool:
-    """Whether a folder, or one of a zip, has a phone app's tables with a time and x, y, z, or OXTS."""
+    """Whether a folder, or one of a zip, has OXTS, or a phone's tables of a time and x, y, z."""
     files = _files(path, inside)
     tables = files.tables()
     gyro = next((tables[table] for table in GYRO if table in tables), "")

@@ -25,16 +25,7 @@ from . import Sequence, _unpacking
 from ._source import head, name
 from ._table_files import kind_of, load
 from ._table_folder import load_split, sequences_below
-from ._table_groups import (
-    MOST_CONSTANTS,
-    group_entries,
-    imus_apart,
-    pose_clock,
-    position_beside,
-    shared_group,
-    time_beside,
-    turned,
-)
+from ._table_groups import MOST_CONSTANTS, group_entries, imus_apart, pose_clock, shared_group, time_beside, turned
 from ._table_layouts import known_layout
 from ._table_map import (
     IMU_TOPIC,
@@ -58,7 +49,7 @@ from ._table_packed import table_name
 from ._table_parts import load_table, recordings_in, refuse_joined
 from ._table_pose_names import why_no_poses
 from ._table_propose import propose
-from ._table_rotations import TURNS, known_rotations, of_angles, of_matrices, unit_by_poses
+from ._table_rotations import known_rotations, of_angles, of_matrices, unit_by_poses
 from ._table_text import Columns, matrix_columns
 from ._table_times import COUNTED, begun_at_zero, count_times
 from ._table_units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
@@ -188,9 +179,8 @@ def _proposal(columns: Columns, given: Entries) -> Proposal:
     """Map of one IMU and its poses, by what is given, names, magnitudes and motion."""
     proposal = known_layout(columns) or propose(columns, given)
     if {"time", "time_unit", "gyro", "accel"} <= proposal.entries.keys():
-        beside = group_entries(columns, proposal.entries, proposal.reasons)
-        proposal.entries |= {name: beside[name] for name in beside if name == "accel_time" or not given.keys() & TURNS}
-        proposal.entries |= pose_clock(columns, proposal.entries) | position_beside(columns, proposal.entries)
+        proposal.entries |= group_entries(columns, proposal.entries, proposal.reasons)
+        proposal.entries |= pose_clock(columns, proposal.entries)
         tries = {"poses": {} if "truth_file" in given else proposal.entries, "orientations": turned(columns, proposal.entries)}
         units = (
             {kind: unit_by_poses(columns, entries) for kind, entries in tries.items()} if "gyro_unit" in proposal.open else {}

@@ -51,10 +51,13 @@ class Labels:
 
     def _with_pair(self, content: Recording | MessageLog, parts: tuple[str, str]) -> MessageLog:
         """Log with the IMU that two topics make up, on `imu` in the folder they share."""
-        topics = [t.name for t in content.topics if t.schema_name == schemas.IMU] if isinstance(content, MessageLog) else []
+        types = {topic.name: topic.schema_name for topic in content.topics} if isinstance(content, MessageLog) else {}
+        topics = [name for name, kind in types.items() if kind == schemas.IMU]
         if isinstance(content, Recording) or not set(parts) <= set(topics):
             named, expected = " and ".join(parts), ", ".join(topics) or "a bag or a log with IMU topics"
-            raise ConfigError(f"no IMU messages to join on {named}", where="imu", expected=expected)
+            are_vectors = all(types.get(part) == schemas.VECTOR3 for part in parts)
+            fix = "Convert without `imu`: other commands join these vectors by it" if are_vectors else ""
+            raise ConfigError(f"no IMU messages to join on {named}", where="imu", expected=expected, fix=fix)
         return replace(content, pairs={whole_of(parts): parts})
 
     def _check(self, topics: Collection[str], name: str, perhaps: Collection[str] = ()) -> None:

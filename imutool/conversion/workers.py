@@ -17,6 +17,8 @@ from imutool.conversion.corrections import Corrections
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.user_labels import Labels
 from imutool.errors import ConfigError, DataError, ImutoolError
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.joined_imu import JOIN_VECTORS
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.target import writing
@@ -181,7 +183,8 @@ def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
         return Outcome()
     write_log(labelled, job.target, compression=job.compression, overwrite=job.overwrite)
     with Log(job.target) as log:
-        lacking = () if log.imu_topics else ("no topic is an IMU",)
+        joined = JOIN_VECTORS if len(log.with_schema((schemas.VECTOR3,))) > 1 else ""
+        lacking = () if log.imu_topics else (f"no topic is an IMU{joined}",)
         own = {name: topic.reflected for name, topic in log.topics.items() if isinstance(topic.reflected, Reflected)}
     stated = [f"{name}: {found.units}, by the comments of its definition" for name, found in own.items() if found.units]
     notes = *filter(None, [job.said]), *labelled.remarks.notes, *stated, *lacking

@@ -27,6 +27,7 @@ from imutool.log_info.pose_coverage import coverage, transforms
 from imutool.log_info.pose_imu_rotation import Agreement, sparse_warnings
 from imutool.log_info.report import ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.joined_imu import JOIN_VECTORS
 from imutool.mcap_io.codec.reflection import LOG_TIME, Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
@@ -37,7 +38,6 @@ from imutool.report import UNSET
 
 CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: motors may idle in the others
 NOISE_WINDOW_S = 1.0
-JOIN_VECTORS = "; imutool debias and others read a gyro's and an accelerometer's vectors as one: --imu gyro=TOPIC,accel=TOPIC"
 CONVERTIBLE = {  # messages of which `convert` makes others
     "nav_msgs/msg/Path": "poses",
     "px4_msgs/msg/VehicleOdometry": "poses",

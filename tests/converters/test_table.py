@@ -155,6 +155,29 @@ def test_the_unit_beside_an_array_in_hdf5_counts(tmp_path):
     np.testing.assert_allclose(imu.accel, ACCEL * G)
 
 
+@pytest.mark.parametrize(
+    ("unit", "size"),
+    [
+        ("seconds since 2020-09-13 12:26:40", 1.0),
+        ("milliseconds since 2020-09-13T12:26:40.0Z", 1e3),
+        ("days since 2020-09-13 12:26:40 UTC", 1 / 86_400),
+        ("seconds since 1970-01-01 00:00:00 +00:00", 1.0),
+    ],
+)
+def test_times_of_netcdf_count_from_the_day_that_their_unit_names(tmp_path, unit, size):
+    import h5py
+
+    t_s = np.arange(300) / 100.0
+    with h5py.File(tmp_path / "glider.nc", "w") as file:
+        file["time"] = size * (t_s + (1_600_000_000.0 if "1970" in unit else 0.0))
+        file["time"].attrs["units"] = unit
+        for name in ("gyro", "accel"):
+            file[name] = np.random.default_rng(1).normal([0.0, 0.0, 9.8], 0.1, (300, 3))
+            file[name].attrs["units"] = "rad/s" if name == "gyro" else "m/s^2"
+    log = table.read_sequence(table.sequences(tmp_path / "glider.nc")[0])
+    np.testing.assert_allclose(log.imus["/imu0"].t_ns - 1_600_000_000 * 10**9, 1e9 * t_s, atol=300)
+
+
 @pytest.mark.parametrize("unit", ["rad/s", [b"rad/s"]])
 def test_numbers_that_netcdf_packs_are_scaled_and_its_fill_values_are_missing(tmp_path, unit):
     import h5py

@@ -11,6 +11,7 @@ import pytest
 import scipy.io
 from pyarrow import feather
 from scipy.spatial.transform import Rotation
+from support.tables import write_csv
 
 from imutool.converters import table
 from imutool.errors import ConfigError, DataError
@@ -253,6 +254,16 @@ def test_angles_that_never_exceed_a_turn_are_in_the_unit_in_which_they_turn_as_t
     np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO, atol=1e-6)
     seen = Rotation.from_quat(log.poses["/ground_truth/pose"].q_wb_wxyz[:, [1, 2, 3, 0]])
     assert (TURN[::10].inv() * seen).magnitude().max() < 1e-5
+
+
+@pytest.mark.parametrize("t", [1.6e9 + np.arange(300), np.repeat(np.arange(100) * 0.01, 3)])
+def test_slow_samples_and_three_of_a_stamp_are_no_increments(tmp_path, t):
+    names = ["time", *(f"gyr_{a}" for a in "xyz"), *(f"acc_{a}" for a in "xyz")]
+    whole = np.random.default_rng(2).integers(-1, 2, (6, 300))
+    whole[5] += 9
+    with pytest.raises(ConfigError) as refused:
+        table.read_sequence(table.sequences(write_csv(tmp_path / "imu.csv", names, [t, *whole]))[0])
+    assert "increments" not in str(refused.value)
 
 
 def test_increments_of_velocity_and_angle_are_asked_about_with_their_rate(tmp_path):

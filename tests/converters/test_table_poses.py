@@ -458,6 +458,21 @@ def test_a_folder_may_hold_packed_tables(tmp_path):
     np.testing.assert_allclose(read(tmp_path).poses["/ground_truth/pose"].p_wb, P_M, atol=1e-6)
 
 
+def test_rates_of_a_reference_are_no_second_imu_and_no_recording(tmp_path):
+    """As a GNSS/INS writes its motion, attitude and position to tables of their own."""
+    (tmp_path / "imu.csv").write_text(imu_text())
+    (tmp_path / "reference_motion.csv").write_text(imu_text())
+    angles = ",".join(f"{name}_deg" for name in ("roll", "pitch", "yaw"))
+    attitude = np.degrees(ANGLES[:, ::-1])
+    (tmp_path / "reference_attitude.csv").write_text(f"t_s,{angles}\n" + rows(T_S, attitude))
+    stated = {"roll_pitch_yaw": [f"reference_attitude/{name}" for name in angles.split(",")]}
+    (sequence,) = table.sequences(tmp_path)
+    log = table.read_sequence(sequence, mapping=stated)
+    assert [*log.imus] == ["/imu0"]
+    np.testing.assert_allclose(np.abs((log.poses["/ground_truth/pose"].q_wb_wxyz * XYZW[:, [3, 0, 1, 2]]).sum(axis=1)), 1.0)
+    assert "/reference_motion_gyro_x_rad_s" in log.scalars
+
+
 @pytest.mark.parametrize("name", ["ref.csv", "reference.csv", "robot_reference.csv"])
 def test_poses_in_a_file_named_as_the_reference_are_true(tmp_path, name):
     (tmp_path / "imu.csv").write_text(imu_text())

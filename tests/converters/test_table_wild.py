@@ -211,8 +211,9 @@ def test_the_fields_of_a_microstrain_sensor_have_the_units_of_its_protocol(tmp_p
 def test_gravity_beside_an_acceleration_of_coremotion_is_added_to_it(tmp_path, named):
     """As Sensor Logger writes the motion of an Apple watch."""
     t_s, rng = np.arange(1000) * 0.01, np.random.default_rng(4)
-    gravity = -Rotation.from_euler("xyz", 0.8 * np.sin(t_s[:, None] * [0.9, 1.3, 0.7])).inv().apply([0.0, 0.0, 1.0])
-    motion, gyro = rng.normal(0.0, 0.2, (2, 1000, 3))
+    angles = np.stack([2.0 * t_s, 0.8 * np.sin(1.3 * t_s), 1.1 * t_s], axis=1)  # turns over and over
+    gravity = -Rotation.from_euler("xyz", angles).inv().apply([0.0, 0.0, 1.0])
+    motion, gyro = rng.normal(0.0, 0.9, (2, 1000, 3))
     columns = {
         form.format(axis): each
         for form, v in zip(named.split("|"), (gyro, gravity, motion), strict=True)
@@ -499,6 +500,17 @@ def test_readings_in_several_states_are_asked_unless_one_has_none(tmp_path):
         else:
             with pytest.raises(ConfigError, match="2 triples of columns look like the accel: acc_x_raw/y/z, acc_x_cal/y/z"):
                 read(path)
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel", "sizes"), [("mrad/s", "mm/s^2", (1e-3, 1e-3)), ("deg/h", "µg", (np.pi / 180.0 / 3600.0, 9.80665e-6))]
+)
+def test_small_units_in_a_header_are_multiplied(tmp_path, gyro, accel, sizes):
+    names = ["time [s]", *(f"gyro_{a} [{gyro}]" for a in "xyz"), *(f"acc_{a} [{accel}]" for a in "xyz")]
+    rates, forces = 0.01 * COUNTS, 9.80665 * ACCEL_G
+    imu = read(write_csv(tmp_path / "imu.csv", names, [T_S, *(rates / sizes[0]).T, *(forces / sizes[1]).T])).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, rates, rtol=1e-9)
+    np.testing.assert_allclose(imu.accel, forces, rtol=1e-9)
 
 
 def test_multiples_of_a_unit_in_a_header_are_applied_and_ranges_are_not(tmp_path):

@@ -17,6 +17,7 @@ from imutool.mcap_io.codec.messages import Messages, Rows, columns
 from imutool.mcap_io.codec.schemas import VECTOR3
 
 SENSOR_WORDS = r"gyro(scope)?", r"accel(erometer)?"
+JOIN_VECTORS = "; imutool debias and others read a gyro's and an accelerometer's vectors as one: --imu gyro=TOPIC,accel=TOPIC"
 Cut = Iterator[tuple[Shaped[np.ndarray, " n"], UInt8[np.ndarray, "n L"]]]  # heads and payloads of equal size
 
 
