@@ -115,7 +115,7 @@ class Survey:
             f"cannot be trusted: {'; '.join(self.reasons)}",
             where=f"{self.log} {self.topic}",
             expected="a log whose IMU can be cleaned without guessing",
-            fix="Look at it with `imutool clean LOG`, leave a rule out, or clean it with `force`",
+            fix="Look at it with `imutool clean LOG`. `imutool clean LOG OUT` can leave a rule out, or clean it all the same",
         )
 
     def report(self) -> SurveyReport:

@@ -75,6 +75,7 @@ def _run(
             page=page,
             json_to=None if common.json_to in (None, "-") else to_location(common.json_to),
             tell=tell,
+            wording=with_flags,
         )
     if not common.write(done.summary(), replace=resume):
         _show(done, target, report)

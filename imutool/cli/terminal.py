@@ -187,6 +187,7 @@ def log_to_stderr(verbose: bool, quiet: bool) -> None:
     """Send log records to stderr: warnings, with `verbose` more, with `quiet` errors only."""
     logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, handlers=[_Lines()], force=True)
     logger.setLevel(logging.INFO if verbose else logging.NOTSET)
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of a cache where there is no home
 
 
 @contextmanager

@@ -27,7 +27,8 @@ EQUAL = 1e-6  # of the largest of several values, by which they may differ
 BINS = 30
 OWN_STYLE = """
 .failed { color: var(--before); font-weight: 600; } .quarantined, .lost { color: var(--mark); font-weight: 600; }
-td.quarantined { white-space: nowrap; } td.log { min-width: 24em; }
+td.quarantined { white-space: nowrap; } td.log { min-width: 9em; } td.log + td { min-width: 16em; }
+@media (min-width: 900px) { td.log { min-width: 24em; } }
 """
 
 
@@ -138,7 +139,8 @@ def _trouble(statistics: Statistics) -> Iterator[str]:
         why = result.error or "; ".join(result.losses) or "; ".join(result.warnings)
         name, why = result.source.removeprefix(below), why.removeprefix(result.source).lstrip(": ")
         rows.append(f'<tr><td class="{status}">{status}</td><td class="log">{text(name)}</td><td>{text(why)}</td></tr>')
-    yield f"<table><thead><tr><th>Status</th><th>Log</th><th>Why</th></tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    head = "<th>Status</th><th>Log</th><th>Why</th>"
+    yield f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
     more = sum(statistics.statuses[name] for name in TROUBLE) - len(statistics.trouble)
     if more:
         yield f'<p class="note">{more:,} more are in fleet.parquet.</p>'
@@ -164,10 +166,10 @@ def _warnings(statistics: Statistics) -> Iterator[str]:
         return
     yield "<h2>What is said of logs</h2>"
     rows = "".join(
-        f"<tr><td class=number>{count:,}</td><td>{text(words)}</td></tr>"
+        f"<tr><td class=number>{count:,}</td><td>{text(words)}</td><td>{text(statistics.first_warned[words])}</td></tr>"
         for words, count in statistics.warnings.most_common(50)
     )
-    yield f"<table><thead><tr><th>Logs</th><th>Warning</th></tr></thead><tbody>{rows}</tbody></table>"
+    yield f"<table><thead><tr><th>Logs</th><th>Warning</th><th>The first of them</th></tr></thead><tbody>{rows}</tbody></table>"
 
 
 def _outliers(comparison: Comparison) -> Iterator[str]:
@@ -259,7 +261,7 @@ def _provenance(settings: Settings) -> Iterator[str]:
     entries = {
         "command": settings.command,
         "model": settings.model or "as each log says",
-        "model sha256": settings.model_sha256,
+        "model sha256": settings.model_sha256 if settings.model else "",
     }
     if settings.command == "debias":
         words = {True: "yes", False: "no"}

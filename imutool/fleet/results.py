@@ -153,6 +153,7 @@ class Statistics:
     scores: list[float] = field(default_factory=list)
     biases: dict[str, list[tuple[float, ...]]] = field(default_factory=lambda: {"gyro": [], "accel": []})
     warnings: Counter[str] = field(default_factory=Counter)
+    first_warned: dict[str, str] = field(default_factory=dict)  # name of the first log with each warning
     trouble: list[Result] = field(default_factory=list)
     peak_bytes: int = 0
     drawn: list[Result] = field(default_factory=list)
@@ -180,7 +181,9 @@ class Statistics:
         for imu in result.imus:
             self.biases["gyro"].append(imu.gyro_bias)
             self.biases["accel"].append(imu.accel_bias)
-        self.warnings.update({_without_topic(warning) for warning in result.warnings})
+        for warning in {_without_topic(warning) for warning in result.warnings}:
+            self.warnings[warning] += 1
+            self.first_warned.setdefault(warning, result.source.rpartition("/")[2])
 
 
 def _without_topic(warning: str) -> str:

@@ -30,6 +30,7 @@ COMPARED = "fleet.json"
 TITLE = b"<title>Fleet "
 MOST_LISTED = 1000  # of the results with a problem, in JSON
 Tell = Callable[[int, int, str], None]
+Wording = Callable[[str], str]
 
 
 @dataclass
@@ -124,14 +125,14 @@ def run(
     page: Location | None = None,
     json_to: Location | None = None,
     tell: Tell = lambda done, total, words: None,
+    wording: Wording = str,
 ) -> FleetReport:
     """Run a command on every log of `source`; write the results and fleet.parquet to `out`.
 
-    The caller writes the summary to `json_to`.
+    The caller writes the summary to `json_to`. The page shows errors in its `wording`.
 
     Raises:
-        ConfigError: no logs; an `out` that holds results already, or cannot be written; a page that exists (without `overwrite`
-            or `resume`), or is the file of a result, as is `json_to`; no engine.
+        ConfigError: no logs, no engine, or an `out` that holds results or cannot be written; a page or `json_to` likewise.
         KeyboardInterrupt: the message says how to go on; no partial file is left.
     """
     began = time.perf_counter()
@@ -168,11 +169,11 @@ def run(
             if isinstance(error, KeyboardInterrupt):
                 raise KeyboardInterrupt(f"{progress.line()}; go on with `resume`") from error
             raise
-        return _report(fleet, journal, source, progress, began, page)
+        return _report(fleet, journal, source, progress, began, page, wording)
 
 
 def _report(
-    fleet: _Fleet, journal: Journal, source: str, progress: Progress, began: float, page: Location | None
+    fleet: _Fleet, journal: Journal, source: str, progress: Progress, began: float, page: Location | None, wording: Wording
 ) -> FleetReport:
     """Write table, comparison and page from the results in the journal, read one by one."""
     settings, out = fleet.settings, fleet.out
@@ -185,7 +186,7 @@ def _report(
     if page is not None:
         from imutool.fleet import page as pages
 
-        every = fleet.results(journal)
+        every = (msgspec.structs.replace(result, error=wording(result.error)) for result in fleet.results(journal))
         pages.write(every, settings, page, out=out, seconds=seconds, source=source, comparison=comparison, overwrite=True)
     not_whole = (result for result in fleet.results(journal) if (result.earlier or result.status) != "ok")
     first = tuple(result for result, _ in zip(not_whole, range(MOST_LISTED), strict=False))

@@ -156,7 +156,7 @@ class _Columns:
         if topic == self.imu_topic:
             with self.log.named(topic):
                 for imu in self.log.topics[topic].decode_imu(rows):
-                    check_finite(imu.sequence, CLEAN_FIX, angular_velocity=imu.gyro, linear_acceleration=imu.accel)
+                    check_finite(imu, CLEAN_FIX, angular_velocity=imu.gyro, linear_acceleration=imu.accel)
                     self._keep(topic, imu.sequence, imu.stamp_ns, imu.gyro, imu.accel)
         elif topic in self.truth_topics:
             if topic not in self.left_out:

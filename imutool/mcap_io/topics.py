@@ -132,7 +132,7 @@ class Topic:
         """
         for cut, layout in _runs(rows, self.schema_name, self.message_encoding):
             columns = decode_scalars(cut.payload, self.schema_name, self.message_encoding, layout)
-            check_finite(cut.sequence, values=columns.values)
+            check_finite(cut, values=columns.values)
             stamp_ns = cut.log_time if columns.stamp_ns is None else columns.stamp_ns
             yield ScalarBatch(cut.log_time, cut.publish_time, cut.sequence, stamp_ns, columns.values, columns.frame_id)
 
@@ -154,11 +154,16 @@ def _runs(rows: Rows, schema_name: str, encoding: str) -> Iterator[tuple[Rows, s
             done = part.stop
             yield rows.where(part), layout
     except LogError as error:
-        what = f"message {rows.sequence[done]} is no {schema_name}: {error.what}"
+        what = f"{_named(rows, done)} is no {schema_name}: {error.what}"
         raise LogError(what, expected=error.expected, fix=error.fix or ("" if error.expected else CUT)) from error
 
 
-def check_finite(sequence: UInt32[np.ndarray, " n"], fix: str = CUT, **fields: Float64[np.ndarray, "n _"]) -> None:
+def _named(batch: Rows | ImuBatch, row: int) -> str:
+    """A message by sequence and log time: many recorders leave the sequence at 0."""
+    return f"message {batch.sequence[row]} (log time {batch.log_time[row] * 1e-9:.3f} s)"
+
+
+def check_finite(batch: Rows | ImuBatch, fix: str = CUT, **fields: Float64[np.ndarray, "n _"]) -> None:
     """Refuses NaN and infinity, naming the message.
 
     Raises:
@@ -168,11 +173,7 @@ def check_finite(sequence: UInt32[np.ndarray, " n"], fix: str = CUT, **fields: F
         good = np.isfinite(values).all(axis=1)
         if not good.all():
             row = int(np.argmin(good))
-            raise LogError(
-                f"message {sequence[row]} has {name} {values[row].tolist()}",
-                expected="finite numbers",
-                fix=fix,
-            )
+            raise LogError(f"{_named(batch, row)} has {name} {values[row].tolist()}", expected="finite numbers", fix=fix)
 
 
 @dataclass(slots=True)
@@ -210,7 +211,7 @@ class StampCheck:
         Raises:
             LogError: NaN, infinity, or a stamp that does not come after the one before it.
         """
-        check_finite(batch.sequence, CLEAN_FIX, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
+        check_finite(batch, CLEAN_FIX, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
         self.fix = CLEAN_FIX
         self.check(batch.stamp_ns, batch.sequence)
 

@@ -197,7 +197,9 @@ def test_warnings_of_a_log_are_results(tmp_path: Path, imutool: Run) -> None:
     assert re.search(r"^warning: .*\bg\b", imutool("info", "g.mcap", "-q", cwd=tmp_path).stdout, re.MULTILINE)
 
 
-@pytest.mark.parametrize("words", [["info", "LOG"], ["info", "LOG", "--json", "-"], ["--help"], ["info", "--help"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "words", [["info", "LOG"], ["info", "LOG", "--json", "-"], ["--help"], ["info", "--help"]], ids=" ".join
+)
 def test_a_reader_that_has_left_is_no_error(logs: Path, command: str, words: list[str]) -> None:
     reading, writing = os.pipe()
     os.close(reading)

@@ -77,7 +77,8 @@ def test_one_bad_log_stops_no_other(fleet: Path, engine: Workers, settings: Sett
     (fleet / "robot_c" / "bell\a.mcap").write_bytes(b"")
     out, page = tmp_path / "out", tmp_path / "page.html"
     told: list[str] = []
-    report = run(str(fleet), str(out), settings, engine, page=page, tell=lambda done, total, words: told.append(words))
+    words: dict[str, Any] = {"tell": lambda done, total, words: told.append(words), "wording": str.upper}
+    report = run(str(fleet), str(out), settings, engine, page=page, **words)
     assert report.progress.exit_code == 5
     assert dict(report.progress.statuses) == {"ok": 2, "failed": 2}
     found = rows(out)
@@ -96,6 +97,7 @@ def test_one_bad_log_stops_no_other(fleet: Path, engine: Workers, settings: Sett
     assert "<script" not in html
     assert "robot &lt;script&gt;alert(1)&lt;" in html
     assert "Of 4 logs 2 are whole; 2 failed." in html
+    assert "NOTHING IN IT CAN BE SAVED" in html  # the command line's wording, as on the terminal
     _Whole().feed(html)
     assert json.dumps(json_values(report.summary()), allow_nan=False)
 

@@ -23,6 +23,7 @@ def test_what_is_said_of_logs_counts_without_their_topics_and_stays_whole() -> N
         said = (f"{topic}: 4 samples missing", "the record at byte 956 is damaged: it says it has 190982 bytes")
         statistics.add(Result(key=topic, source=topic, target="", status="ok", warnings=said))
     assert statistics.warnings == {"4 samples missing": 2, "the record at byte 956 is damaged: it says it has 190982 bytes": 2}
+    assert statistics.first_warned["4 samples missing"] == "imu0"  # of a warning alone nobody knows the log
 
 
 def test_of_logs_that_are_not_whole_the_common_folder_stands_once() -> None:
@@ -40,6 +41,12 @@ def test_the_page_of_a_diagnosis_says_what_it_takes_to_do_it_again() -> None:
     settings = Settings(command="diagnose", robot_from=r"^(\w+)/", sim="/sims", imu=("/imu1",), truth="/mocap")
     said = page.html([], settings, seconds=1.0, source="logs")
     assert all(f"<dd>{words}</dd>" in said for words in (r"^(\w+)/", "/sims", "/imu1", "/mocap"))
+
+
+def test_without_a_model_there_is_no_digest_of_one() -> None:
+    said = page.html([], Settings(command="debias", model_sha256="0123"), seconds=1.0, source="logs")
+    assert "as each log says" in said
+    assert "0123" not in said
 
 
 def test_the_numbers_below_the_histograms_do_not_overlap(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -195,7 +195,7 @@ def test_a_payload_that_is_no_message_is_refused_by_its_number(foreign: Foreign,
     messages = imu_messages(make)
     *head, payload = messages[7]
     messages[7] = (*head, payload[:12] + b"\xff" * 4 + payload[16:])  # the length of a text
-    with pytest.raises(LogError, match=r"message 7 is no sensor_msgs/msg/Imu: .*\. Cut the log before or after it"):
+    with pytest.raises(LogError, match=r"message 7 \(log .*\) is no sensor_msgs/msg/Imu: .*\. Cut the log before or after it"):
         read(foreign(messages))
 
 
@@ -217,7 +217,7 @@ def test_scalars_a_recording_cannot_hold_are_left_out_and_named(
     with caplog.at_level(logging.WARNING):
         recording = read(foreign(imu_messages(make) + bad + good))
     assert list(recording.scalars) == ["/height"]
-    assert "/battery is left out: message 1 has values [nan]" in caplog.text
+    assert "/battery is left out: message 1 (log time 1403638128.245 s) has values [nan]" in caplog.text
 
 
 # ── memory and what is not done ──────────────────────────────────────────────────────────────────────────────────────
@@ -460,7 +460,7 @@ def test_nan_and_infinity_in_imu_or_truth_are_refused(foreign: Foreign, make: Ma
     messages = imu_messages(make)
     t = messages[7][2]
     messages[7] = ("/imu", schemas.IMU, t, t, 7, make(schemas.IMU, t, np.zeros(3), np.array([0, bad, 0])))
-    with pytest.raises(LogError, match=r"/imu: message 7 has linear_acceleration \[0.0, (nan|inf), 0.0\].*--clean"):
+    with pytest.raises(LogError, match=r"/imu: message 7 \(log .*\) has linear_acceleration \[0.0, (nan|inf), 0.0\].*--clean"):
         read(foreign(messages))
     pose = ("/mocap", schemas.POSE, t, t, 0, make(schemas.POSE, t, np.array([bad, 0, 0]), np.ones(4) / 2))
     with pytest.raises(LogError, match=r"/mocap: 1 of 1 poses are lost"):

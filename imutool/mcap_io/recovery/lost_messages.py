@@ -53,7 +53,8 @@ def really_lost(scan: Scan, blocks: list[MessageBlock], summaries: list[Summary]
     for number in sorted({number for number, _ in missing}):
         entries = [entry for n, entry in missing if n == number]
         start = min(entry.chunk_start_offset for entry in entries)
-        why = f"a summary lists {len(entries)} chunks that are not in the file"
+        named = "1 chunk that is" if len(entries) == 1 else f"{len(entries)} chunks that are"
+        why = f"a summary lists {named} not in the file"
         gap = Gap(min(max(0, start), scan.source.size), 0, why, recording=number)
         _count(gap, entries)
         yield gap

@@ -180,7 +180,7 @@ def build(
     ]
     if len(imu) > MAX_CURVE_ROWS:
         of_paths.append(
-            f"Curves of {len(imu)} samples are drawn with at most {MAX_CURVE_ROWS} rows: the extremes of each stretch."
+            f"Curves of {len(imu):,} samples are drawn with at most {MAX_CURVE_ROWS:,} rows: the extremes of each stretch."
         )
     shown, of_events = events_within([*events, *stop_events(imu), *worst], start_ns, end_ns)
     return RunData(
@@ -263,6 +263,7 @@ def _spectra(run: Run) -> Mapping[str, Spectrum]:
 METADATA_PREFIX = "imutool"  # of the names of metadata records that imutool writes
 MAX_ENTRIES = 60  # from the log's records, which anybody may have written
 MAX_VALUE_LENGTH = 200  # letters
+NO_VALUE = ("", "null", "{}")
 
 
 def provenance(
@@ -282,7 +283,11 @@ def provenance(
     entries |= {**settings, **{f"model {name}": how for name, how in models.items()}}
     entries |= {"imutool": __version__, "numpy": np.__version__, "python": platform.python_version()}
     records = [
-        (name, key, value) for name, values in metadata if name.startswith(METADATA_PREFIX) for key, value in values.items()
+        (name, key, value)
+        for name, values in metadata
+        if name.startswith(METADATA_PREFIX)
+        for key, value in values.items()
+        if value not in NO_VALUE
     ]
     entries |= {_cut(f"{name}: {key}"): value for name, key, value in records[:MAX_ENTRIES]}
     if len(records) > MAX_ENTRIES:

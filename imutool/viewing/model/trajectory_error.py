@@ -21,7 +21,8 @@ ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
 RESET_S = 10.0
 WINDOWS_S = (1.0, 5.0, 10.0, 30.0)
 WINDOWS_NOTE = (
-    "Root mean squares at the ends of windows that each start from the truth, by the Euler rule, which lags by half a sample."
+    "Root mean squares at the ends of windows that each start from the truth, by the Euler rule, which lags by half a sample. "
+    "imutool evaluate prints the drift by the trapezoidal rule."
 )
 
 

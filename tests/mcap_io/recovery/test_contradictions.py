@@ -29,7 +29,7 @@ by_mcap, stretches = log_damage.by_mcap, log_damage.stretches
 PROVEN = {
     "new_log_over_older": (173, "a summary lists 5 chunks that are not in the file"),
     "index_lengths_wrong": (340, ""),
-    "chunk_behind_damage": (313, "a summary lists 1 chunks that are not in the file"),
+    "chunk_behind_damage": (313, "a summary lists 1 chunk that is not in the file"),
     "two_logs_overlapped": (139, "the chunk at byte 11691 is damaged"),  # 152, of which 13 are there twice
     "channel_65535": (324, ""),
 }

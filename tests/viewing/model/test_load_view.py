@@ -85,6 +85,7 @@ def test_a_log_is_shown_with_where_it_comes_from(made: Recording, log: Path) -> 
     assert (told["IMU"], told["truth"]) == ("/imu0", "/ground_truth/pose")
     assert "start" not in told  # nothing was started
     assert "imutool: writer" in told
+    assert not {"", "null", "{}"} & set(told.values())  # what a record does not know is no entry
 
 
 def test_log_times_are_exact_and_not_the_stamps(made: Recording, tmp_path: Path) -> None:

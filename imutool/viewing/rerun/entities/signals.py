@@ -102,7 +102,7 @@ def decimation_note(data: RunData) -> list[str]:
     """Sentence for the report where computed curves of this log are decimated."""
     if all(len(trace.run.imu) <= MAX_DERIVED_ROWS for trace in data.traces):
         return []
-    return [f"Errors and biases are drawn with at most {MAX_DERIVED_ROWS} rows: the extremes of each stretch."]
+    return [f"Errors and biases are drawn with at most {MAX_DERIVED_ROWS:,} rows: the extremes of each stretch."]
 
 
 @dataclass(frozen=True)
