@@ -204,8 +204,7 @@ def _closed(
         better = search(begin=(*first.findings, *again.findings))
         if {finding.effect for finding in better.findings} == {finding.effect for finding in first.findings}:
             break
-        first = better
-        rewrite(first)
+        rewrite(first := better)
     try:
         figures = None if metric is None else (metric[1], figure(metric[0], log))
     except ImutoolError as error:  # for a figure no diagnosis is thrown away
@@ -231,8 +230,7 @@ def _make(
     remarks: list[str] = []
     seen: list[RunData] = []
     missing = {name for name, (library, _) in NEEDS.items() if find_spec(library) is None}
-    wanted = logs is not None and LOG not in missing
-    wanted = wanted and not (d.bias.size and np.isnan(d.bias).all())  # it draws an IMU
+    wanted = logs is not None and LOG not in missing and not (d.bias.size and np.isnan(d.bias).all())  # it draws an IMU
     report = Forked(partial(_report, d, LOG if wanted else None))
     if logs is not None and wanted:
         try:
