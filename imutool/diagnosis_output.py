@@ -26,7 +26,7 @@ from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.second_simulation import simulate_again
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_noise_file, to_physics_file
-from imutool.errors import ConfigError, ImutoolError
+from imutool.errors import ConfigError, ImutoolError, required
 from imutool.file_location import Location, local
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
@@ -147,6 +147,8 @@ def diagnose(
     refuse(folder, overwrite=overwrite)
     given = local(sim, "close") if close and sim is not None else None
     was = None if metric is None or given is None else figure(metric, given)
+    if find_spec(DRAWN[0]) is not None:
+        required("matplotlib.figure", DRAWN[1])  # once, here: each process that draws is a copy of this one
     drawn = Forked(partial(_drawings, look), idle=True)  # of the logs, while they are diagnosed, where time is left
     diagnosis = search()
     if tell is not None:
@@ -202,8 +204,7 @@ def _closed(
         better = search(begin=(*first.findings, *again.findings))
         if {finding.effect for finding in better.findings} == {finding.effect for finding in first.findings}:
             break
-        first = better
-        rewrite(first)
+        rewrite(first := better)
     try:
         figures = None if metric is None else (metric[1], figure(metric[0], log))
     except ImutoolError as error:  # for a figure no diagnosis is thrown away
@@ -229,8 +230,7 @@ def _make(
     remarks: list[str] = []
     seen: list[RunData] = []
     missing = {name for name, (library, _) in NEEDS.items() if find_spec(library) is None}
-    wanted = logs is not None and LOG not in missing
-    wanted = wanted and not (d.bias.size and np.isnan(d.bias).all())  # it draws an IMU
+    wanted = logs is not None and LOG not in missing and not (d.bias.size and np.isnan(d.bias).all())  # it draws an IMU
     report = Forked(partial(_report, d, LOG if wanted else None))
     if logs is not None and wanted:
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -148,7 +149,7 @@ class Pair(AlignedLog):
     sim_lsb: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6), kw_only=True)
     channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING, kw_only=True)
 
-    @property
+    @cached_property
     def bias_std(self) -> Float64[np.ndarray, " k"]:
         """Prior of a turn-on bias, by axis (rad/s, m/s²)."""
         own = self.settings.split
