@@ -6,6 +6,7 @@ Base class of the array types of `imutool.recording`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, replace
 from itertools import pairwise
 from numbers import Real
@@ -126,11 +127,9 @@ class Columns:
 
 def _same(a: object, b: object) -> bool:
     """Whether two values are equal bit for bit (-0.0 and 0.0 differ, as they do in a file)."""
-    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        if not (isinstance(a, np.ndarray) and isinstance(b, np.ndarray)):
-            return False
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
-    return bool(a == b)
+    return not isinstance(a, np.ndarray) and not isinstance(b, np.ndarray) and bool(a == b)
 
 
 def converted(value: Any, where: str, *, times: bool = False) -> Shaped[np.ndarray, "..."]:
@@ -159,20 +158,18 @@ def converted(value: Any, where: str, *, times: bool = False) -> Shaped[np.ndarr
         fix = "Convert seconds with np.round(1e9 * seconds).astype(np.int64)"
     elif times and array.dtype == object and getattr(array.flat[0], "tzinfo", None) is not None:
         fix = "Take the time zone off with `tz_convert(None)`"
-    raise DataError(
-        f"{where} is {kind}{' with masked values' * masked}", expected=f"{wanted}[n{'' if times else ', ...'}]", fix=fix
-    )
+    what = f"{where} is {kind}{' with masked values' * masked}"
+    raise DataError(what, expected=f"{wanted}[n{'' if times else ', ...'}]", fix=fix)
 
 
 def _exactly(array: Shaped[np.ndarray, "..."], wanted: np.dtype[Any]) -> Shaped[np.ndarray, "..."] | None:
     """The array in another type; None where this loses something."""
     kind, times = array.dtype.kind, wanted.kind == "i"
     if times and kind == "M":
-        try:
+        with suppress(OverflowError):  # of numpy from 2.5 on; before, other numbers stand there
             ns = array.astype("datetime64[ns]")
-        except OverflowError:  # from numpy 2.5 on; before, other numbers stand there
-            return None
-        return ns.astype(wanted) if not np.isnat(array).any() and np.array_equal(ns.astype(array.dtype), array) else None
+            return ns.astype(wanted) if not np.isnat(array).any() and np.array_equal(ns.astype(array.dtype), array) else None
+        return None
     if array.size and kind in "iu" and kind != wanted.kind:
         most = MOST_EXACT[wanted.kind]
         return array.astype(wanted) if -most <= array.min() and array.max() <= most else None

@@ -1,4 +1,4 @@
-"""Whether a model may be kept: its errors over the held-out parts of its training logs, and its drift over an hour."""
+"""Errors of a model over the held-out parts of its training logs, and its drift in an hour."""
 
 from __future__ import annotations
 
