@@ -43,7 +43,7 @@ from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import AXES, SENSORS
 
 RESONANT = {"mount_resonance", "vibration", "timestamp_jitter"}
-JITTER, QUANTIZATION = "timestamp_jitter", "quantization"
+JITTER, QUANTIZATION = "timestamp_jitter", "quantization"  # where stamps are wrong, signals are not
 SHOWN_KNOTS = 41  # of a curve without a name in the report
 
 
@@ -79,8 +79,7 @@ def summarize(
     expected_too = {one.effect.key for one, finding in both if shared(finding, sim_findings)} | {of.key for of, _ in clock}
     before = [with_effects(pair, tuple(entry for entry in chosen if entry[0].key in expected_too)) for pair in pairs]
     p_values = {str(signal): _p_value(findings, signal) for signal in SENSORS}
-    discounted = expected_too | {JITTER}  # where stamps are wrong, signals are not
-    baseline = [with_effects(pair, tuple(entry for entry in chosen if entry[0].key in discounted)) for pair in pairs]
+    baseline = [with_effects(pair, tuple(of for of in chosen if of[0].key in {JITTER, *expected_too})) for pair in pairs]
     unexplained = unexplained_residuals(logs, after, noise, settings.held_out)
     located = locate_findings(pairs, baseline, after, noise, findings, p_values, settings.localization) if findings else []
     if not located:  # where something is left all the same, it is said where

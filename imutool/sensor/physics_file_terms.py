@@ -13,6 +13,7 @@ from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.noise import datasheet
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.effects.temperature import NO_CHANNEL
 from imutool.sensor.samples import SensorSamples
 from imutool.units import AXES, UNITS, Sensor
 
@@ -146,7 +147,8 @@ def _channel(samples: SensorSamples, name: str) -> Float64[np.ndarray, " n"]:
     """
     if name not in samples.channels:
         listed = ", ".join(sorted(samples.channels)) or "(none)"
-        raise DataError(f"no channel {name}", where="physics", expected=f"one of the log's channels: {listed}")
+        expected = f"one of the log's channels: {listed}"
+        raise DataError(f"no channel {name}", where="physics", expected=expected, fix=NO_CHANNEL)
     return samples.channels[name]
 
 

@@ -27,7 +27,10 @@ Readings = Float64[np.ndarray, "n 3"]
 
 
 def with_common_conventions(pairs: Sequence[Pair], of: str = "simulation") -> tuple[list[Pair], list[Finding]]:
-    """Recordings in the units and axes of their reference (`of`), and findings of those that differ."""
+    """Recordings in the units and axes of their reference, and findings of those that differ.
+
+    `of` is what the reference is called.
+    """
     changes: dict[Sensor, tuple[float, Matrix]] = {}
     for k, sensor in enumerate(SENSORS):
         part = slice(3 * k, 3 * k + 3)

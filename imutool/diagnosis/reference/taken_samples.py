@@ -85,9 +85,10 @@ def on_own_clock(recording: Recording) -> tuple[Recording, float]:
 
 
 def without_common_jitter(real: Recording, sim: Recording, settings: TimestampSettings) -> tuple[Recording, Recording]:
-    """Both on an even clock, if the simulation has the recording's stamps and noise: it was made from its samples.
+    """Both on an even clock, if the simulation was made of the recording's own samples.
 
-    What wanders in both alike sets neither apart, and no spline has to pass through noise between two stamps.
+    Then it has its stamps and its noise. What wanders in both alike sets neither apart, and no spline has to pass through noise
+    between two stamps.
     """
     t_ns, *rows = np.intersect1d(real.imu.t_ns, sim.imu.t_ns, return_indices=True)
     if len(t_ns) <= MOSTLY_COMMON * len(sim.imu):

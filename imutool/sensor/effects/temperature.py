@@ -8,6 +8,7 @@ from imutool.errors import DataError
 from imutool.sensor.effect import Effect, Stage, Theta, each_axis
 from imutool.sensor.samples import SensorSamples
 
+NO_CHANNEL = "Give a log that has it; a diagnosis with `close` takes the channel of the recording"
 OF_IMU = ("imu", "gyro", "accel")  # in the name of a channel: a battery or a motor has a temperature, too
 
 
@@ -21,7 +22,8 @@ def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
     """
     names = [name for name in samples.channels if "temperature" in name.lower()]
     if not names:
-        raise DataError("no temperature channel", where="temperature", expected="a channel with temperature in its name")
+        expected = "a channel with temperature in its name"
+        raise DataError("no temperature channel", where="temperature", expected=expected, fix=NO_CHANNEL)
     T = samples.channels[min(names, key=lambda name: (not any(word in name.lower() for word in OF_IMU), name))]
     gyro, accel = (np.outer(own, T - T.mean()).T for own in (k[:3], k[3:]))
     return samples.with_readings(samples.gyro + gyro, samples.accel + accel)
