@@ -115,7 +115,7 @@ class Survey:
             f"cannot be trusted: {'; '.join(self.reasons)}",
             where=f"{self.log} {self.topic}",
             expected="a log whose IMU can be cleaned without guessing",
-            fix="Look at it with `imutool clean LOG`. `imutool clean LOG OUT` can leave a rule out, or clean it all the same",
+            fix="Look at it with `imutool clean LOG`. `imutool clean LOG OUT --force` cleans it all the same",
         )
 
     def report(self) -> SurveyReport:

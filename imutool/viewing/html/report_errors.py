@@ -13,7 +13,7 @@ from imutool.viewing.html.drawing import Panel, Picture, at_least_three_ticks, l
 from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, text
 from imutool.viewing.html.report_paths import style_of
 from imutool.viewing.html.report_wording import alignment_text, format_number, format_quantity
-from imutool.viewing.model.decimation import DecimatedLine, decimate_extremes
+from imutool.viewing.model.decimation import DecimatedLine, decimate_angle, decimate_extremes
 from imutool.viewing.model.events import KINDS, Event
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift
@@ -111,7 +111,8 @@ def _draw(
             shown = np.where(error > 0.0, error, np.nan) if log else error  # the start is exact: log(0)
             label = f"{trace.name}: {title.lower()}, {name}" if axes is not panels[0] else trace.name
             style = style_of(data, trace)
-            line = axes.plot(*decimate_extremes(t, shown), lw=0.9 if trace.is_raw else 1.3, label=label, **style)
+            curve = decimate_angle(t, shown) if signed and unit == "°" else decimate_extremes(t, shown)
+            line = axes.plot(*curve, lw=0.9 if trace.is_raw else 1.3, label=label, **style)
             lines += line if axes is panels[0] else []
         _limits(axes, values, signed=signed, log=log)
         if beyond:

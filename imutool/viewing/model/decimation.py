@@ -36,6 +36,19 @@ def decimate_extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[Decimat
     return np.insert(t[keep], at, (t[gaps] + t[gaps + 1]) / 2.0), np.insert(y[keep], at, np.nan)
 
 
+def decimate_angle(t: Line, angle_deg: Line) -> tuple[DecimatedLine, DecimatedLine]:
+    """Decimate an angle (deg), with a break where it goes on from 180° at -180°.
+
+    A line from top to bottom would pass for a turn back.
+    """
+    wraps = np.flatnonzero(np.abs(np.diff(angle_deg)) > 180.0) + 1
+    buckets = max(1, BUCKETS // (len(wraps) + 1))
+    parts = [decimate_extremes(*part, buckets) for part in zip(np.split(t, wraps), np.split(angle_deg, wraps), strict=True)]
+    ends = [(part[0][-1:], np.array([np.nan])) for part in parts]
+    times, angles = zip(*(piece for pair in zip(parts, ends, strict=True) for piece in pair), strict=True)
+    return np.concatenate(times), np.concatenate(angles)
+
+
 def true_intervals(t: Line, mask: Bool[np.ndarray, " n"]) -> list[tuple[float, float]]:
     """Intervals of time in which a mask is true."""
     return [(float(t[first]), float(t[end - 1])) for first, end in true_ranges(mask)]

@@ -191,6 +191,14 @@ def test_of_many_events_the_longest_are_listed(seen: RunData) -> None:
     assert "gap 89" in "".join(report_errors.event_table(data))
 
 
+def test_an_angle_that_wraps_is_no_line_from_top_to_bottom() -> None:
+    t = np.linspace(0.0, 100.0, 20_000)
+    _, drawn = decimation.decimate_angle(t, np.mod(10.0 * t + 180.0, 360.0) - 180.0)
+    assert np.nanmax(np.abs(np.diff(drawn))) < 10.0
+    assert np.nanmin(drawn) < -179.0
+    assert np.nanmax(drawn) > 179.0
+
+
 def test_no_two_of_many_models_look_alike(seen: RunData) -> None:
     models = [replace(seen.traces[1], run=replace(seen.traces[1].run, name=f"model {k}")) for k in range(11)]
     data = replace(seen, traces=(seen.traces[0], *models))

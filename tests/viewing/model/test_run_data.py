@@ -209,7 +209,7 @@ def test_a_log_too_long_to_be_drawn_whole_says_so(
 ) -> None:
     assert not any("at most" in note for note in data.notes)
     monkeypatch.setattr(load_view, "MAX_CURVE_ROWS", 1000)
-    assert any("at most 1000 rows" in note for note in build(recording, runs).notes)
+    assert any("at most 1,000 rows" in note for note in build(recording, runs).notes)
 
 
 def test_the_table_has_a_row_per_figure_and_a_column_per_run(data: RunData) -> None:

@@ -417,6 +417,11 @@ def test_a_name_is_shortened_by_the_words_that_all_models_begin_with(data: RunDa
 # ── what is not there ──
 
 
+def test_the_command_that_opens_a_file_is_quoted_for_a_shell(recording: Recording, tmp_path: Path) -> None:
+    data = build(recording, [Run.raw(recording.imu)])
+    assert scene.save([data], tmp_path / "a b.rrd").said.endswith(f"rerun '{tmp_path / 'a b.rrd'}'")
+
+
 def test_no_line_crosses_a_gap_of_the_samples(recording: Recording, tmp_path: Path) -> None:
     """Rerun drew a straight one over a second without samples; a row of NaN in its middle breaks it."""
     kept = ~np.isin(np.arange(len(recording.imu)), np.arange(400, 600))
