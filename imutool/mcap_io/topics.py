@@ -170,8 +170,7 @@ def check_finite(batch: Rows | ImuBatch, fix: str = CUT, **fields: Float64[np.nd
         LogError: a value that is not finite.
     """
     for name, values in fields.items():
-        good = np.isfinite(values).all(axis=1)
-        if not good.all():
+        if not (good := np.isfinite(values).all(axis=1)).all():
             row = int(np.argmin(good))
             raise LogError(f"{_named(batch, row)} has {name} {values[row].tolist()}", expected="finite numbers", fix=fix)
 

@@ -49,9 +49,10 @@ def held_out_errors(
 
 @torch.no_grad()
 def runs_away(model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float[Tensor, "logs 6"]) -> bool:
-    """Whether a drift carries the bias of a log further than a new turn-on does, in an hour at rest or of its motion.
+    """Whether a drift carries the bias of a log further than a new turn-on does.
 
-    The logs are minutes long, and a field that is right for minutes may be wrong without bound. `rest` are their biases.
+    In an hour at rest, or in an hour of the log's motion, again and again. The logs are minutes long, and a field that is
+    right for minutes may be wrong without bound. `rest` are their biases.
     """
     columns = COLUMNS[sensor]
     for log, bias in enumerate(rest):

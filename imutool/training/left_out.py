@@ -166,7 +166,7 @@ def compare(
 
 
 def better_without(scores: Sequence[Score], kept: str) -> Iterator[str]:
-    """Warnings of raw samples or a bias at rest whose orientation errors are smaller than those of the candidate kept."""
+    """Warnings of raw samples, or a bias at rest, that are better than the candidate kept."""
     logs, aoe = list(dict.fromkeys(score.log for score in scores)), DECISIVE["gyro"][0]
     errors = {model: _log_errors(scores, logs, model, aoe) for model in (kept, *WITHOUT_TRAINING)}
     for model, (name, fix) in WITHOUT_TRAINING.items():
