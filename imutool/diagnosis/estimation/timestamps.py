@@ -21,6 +21,7 @@ from imutool.units import ASCII_UNITS, SENSORS, UNITS, Sensor
 SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft limit is looked for
 LEAST_VALUES, LEAST_ROWS = 3, 100  # of a grid
 READ, NOISY = 0.999, 6.0  # of the readings are no glitch; deviations of a sample by which noise goes beyond a limit
+FINER = 0.05  # of the noise, that readings differ by right below a limit
 UNEVEN = "stamps jitter, samples do not"
 
 
@@ -217,7 +218,9 @@ def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "_ 6
         part = slice(3 * k, 3 * k + 3)
         at = np.abs(real[:, part]) >= most * (1.0 - settings.limit_error)
         beyond = (model[:, part] * np.sign(real[:, part]))[at] > most
-        chance = float(binom.sf(beyond.sum() - 1, len(beyond), 0.5)) * tried
+        below = np.abs(real[:, part])[np.abs(real[:, part]) < most * (1.0 - 1e-9)].max(initial=0.0)
+        is_cut = most - below < FINER * white_noise(real[:, part]).max()  # no grid lets it recur; its bias may hide what is cut
+        chance = 0.0 if is_cut else float(binom.sf(beyond.sum() - 1, len(beyond), 0.5)) * tried
         if chance > 1e-2 and beyond.mean() < 0.9:
             continue
         parameters[f"{signal}_limit"] = Estimate(most, settings.limit_error * most, UNITS[signal])
@@ -228,13 +231,10 @@ def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "_ 6
         return []
     seen_in = signal_of if len(parameters) == 1 else "both"
     length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
-    held_out = HeldOut(
-        float(np.sqrt(powers[0] / powers[2])), float(np.sqrt(powers[1] / powers[2])), ASCII_UNITS[signal_of], round(length, 1)
-    )
+    before_rms, after_rms = (float(np.sqrt(power / powers[2])) for power in powers[:2])
+    held_out = HeldOut(before_rms, after_rms, ASCII_UNITS[signal_of], round(length, 1))
     share = float(np.clip(1.0 - powers[1] / max(powers[0], 1e-300), 0.0, 1.0))
-    return [
-        Finding("saturation", seen_in, share, min(p, 1.0), min(p, 1.0), parameters, "readings are clipped at +-limit", held_out)
-    ]
+    return [Finding("saturation", seen_in, share, p, p, parameters, "readings are clipped at +-limit", held_out)]
 
 
 def late_stamps(pairs: Sequence[Pair]) -> list[Finding]:

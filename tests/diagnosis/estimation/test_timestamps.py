@@ -205,6 +205,18 @@ def test_a_dead_axis_has_no_limit() -> None:
     assert timestamps.limits(one.real * np.array([0, 0, 0, 1, 1, 1])) == {}
 
 
+def test_an_axis_that_is_always_at_its_limit_is_cut_though_its_bias_hides_it() -> None:
+    """A robot on a flat floor: gravity and the bias of z are beyond the limit, and the bias is unknown."""
+    one = planted.pair(planted.rich())
+    noisy = 9.8 + 0.02 * np.random.default_rng(4).normal(size=len(one.real))
+    real, expected = one.real.copy(), one.real.copy()
+    real[:, 3:5], real[:, 5], expected[:, 5] = 0.0, np.minimum(noisy, 9.79), 9.7
+    (found,) = timestamps.saturated([replace(one, real=real)], [expected], 50)
+    assert found.parameters["accel_limit"].value == 9.79
+    real[:, 5] = np.minimum(np.round(noisy, 1), 9.8)  # on a grid the largest recurs
+    assert not timestamps.saturated([replace(one, real=real)], [expected], 50)
+
+
 def test_the_same_reading_again_and_again_is_no_limit_where_no_more_was_expected() -> None:
     """A parked vehicle on a coarse grid reads its largest value often, and nothing says that it should read more."""
     t = planted.clock()
