@@ -54,7 +54,7 @@ class Debias:
         self.clock = StampCheck()
 
     def __call__(self, batch: ImuBatch) -> DerivedBatch:
-        check_finite(batch.sequence, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
+        check_finite(batch, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
         self.clock.check(batch.stamp_ns, batch.sequence)
         self.stamps += batch.stamp_ns.tolist()
         bias = np.tile(BIAS, (len(batch.stamp_ns), 1))
