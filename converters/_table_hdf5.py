@@ -119,7 +119,7 @@ def _since_1970(values: np.ndarray, unit: str) -> np.ndarray | None:
     day, clock = ([int(part) for part in re.findall(r"\d+", match[each] or "0:0:0")] for each in ("day", "clock"))
     try:
         start = np.datetime64("{:04d}-{:02d}-{:02d}T{:02d}:{:02d}:{:02d}".format(*day, *clock), "ns")
-    except ValueError:
+    except (ValueError, OverflowError):
         return None
     steps = values * int(size) if values.dtype.kind in "iu" else np.rint(values * size)
     return np.asarray(steps.astype(np.int64) + start.astype(np.int64))
