@@ -276,10 +276,17 @@ def test_clocks_without_a_date_go_on_after_midnight_and_excels_after_the_hour():
     assert calendar_times(["9999-01-01 00:00:00"]) is None
 
 
+def object_of_matlab(folder):
+    """An element of a .mat file that holds an object, as a serial port, a timer or a figure."""
+    scipy.io.savemat(folder / "one.mat", {"x": 1.0})
+    texts = b"".join(np.array([1, 8], np.uint32).tobytes() + word.ljust(8, b"\0") for word in (b"port", b"MCOS", b"serial"))
+    inside = np.array([6, 8, 17, 0], np.uint32).tobytes() + texts + (folder / "one.mat").read_bytes()[128:]
+    return np.array([14, len(inside)], np.uint32).tobytes() + inside
+
+
 def test_objects_of_matlab_are_refused_with_what_to_save(tmp_path):
     header = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
-    array = np.array([6, 8, 17, 0], np.uint32).tobytes()  # flags of an array of the class of objects
-    (tmp_path / "log.mat").write_bytes(header + np.array([14, len(array)], np.uint32).tobytes() + array)
+    (tmp_path / "log.mat").write_bytes(header + object_of_matlab(tmp_path))
     with pytest.raises(DataError, match="holds MATLAB objects"):
         table.read_sequence(table.sequences(tmp_path / "log.mat")[0])
 
@@ -287,11 +294,8 @@ def test_objects_of_matlab_are_refused_with_what_to_save(tmp_path):
 def test_arrays_beside_an_object_of_matlab_are_read_and_the_object_is_named(tmp_path):
     """A workspace that was saved whole holds a serial port, a timer or a figure."""
     scipy.io.savemat(tmp_path / "log.mat", {"t_ns": T_NS, "SENSgyro": GYRO, "SENSacc": ACCEL})
-    scipy.io.savemat(tmp_path / "one.mat", {"x": 1.0})
-    texts = b"".join(np.array([1, 8], np.uint32).tobytes() + word.ljust(8, b"\0") for word in (b"port", b"MCOS", b"serial"))
-    inside = np.array([6, 8, 17, 0], np.uint32).tobytes() + texts + (tmp_path / "one.mat").read_bytes()[128:]
     with (tmp_path / "log.mat").open("ab") as file:
-        file.write(np.array([14, len(inside)], np.uint32).tobytes() + inside)
+        file.write(object_of_matlab(tmp_path))
     columns = load(tmp_path / "log.mat", "mat")
     np.testing.assert_array_equal(columns.values["SENSgyro[2]"], GYRO[:, 2])
     assert propose(columns).entries["accel"] == [f"SENSacc[{axis}]" for axis in range(3)]
@@ -301,7 +305,7 @@ def test_arrays_beside_an_object_of_matlab_are_read_and_the_object_is_named(tmp_
 def test_an_object_of_matlab_hides_no_array_that_is_too_large(tmp_path, monkeypatch):
     scipy.io.savemat(tmp_path / "log.mat", {"zeros": np.zeros(10_000)}, do_compression=True)
     with (tmp_path / "log.mat").open("ab") as file:
-        file.write(np.array([14, 16, 6, 8, 17, 0], np.uint32).tobytes())
+        file.write(object_of_matlab(tmp_path))
     monkeypatch.setattr("imutool.converters._table_mat.LIMIT", 50_000)
     with pytest.raises(DataError, match="unpacks to"):
         load(tmp_path / "log.mat", "mat")
