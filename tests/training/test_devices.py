@@ -24,6 +24,7 @@ from imutool.bias.neural_ode import Config
 from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
 from imutool.training.fit import Epoch, Training
+from imutool.training.objectives.objective import AdamW
 from imutool.training.run import checkpoint_path, train
 from imutool.training.settings import TrainSettings, settings_of
 
@@ -132,9 +133,9 @@ def test_all_that_is_made_of_it_stays_there(gpu: Tensor) -> None:
 def test_models_and_their_gradients_and_copies_are_there_and_come_back(gpu: Tensor) -> None:
     model = nn.Sequential(nn.Linear(3, 2), nn.BatchNorm1d(2)).to("cuda")
     mean = AveragedModel(copy.deepcopy(model), multi_avg_fn=get_ema_multi_avg_fn(0.5), use_buffers=True)  # type: ignore[no-untyped-call]
-    optimizer = torch.optim.AdamW(model.parameters())
+    optimizer = AdamW([(list(model.parameters()), 0.0)])
     model(torch.stack([gpu, gpu**2])).square().sum().backward()
-    optimizer.step()
+    optimizer.step(1e-3)
     mean.update_parameters(model)
     mean.update_parameters(model)
     parameters = list(model.parameters())
