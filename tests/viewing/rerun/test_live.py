@@ -27,6 +27,7 @@ from imutool.viewing.rerun import live, scene, viewer
 SECONDS, BLOCK = 12.0, 250  # samples at 200 Hz, as from a log with images
 PATH_M = 1e-4  # single precision, in which Rerun keeps positions, over some hundred metres
 SERVER_STARTS_S = 10.0
+DIES_S = 60.0  # for a viewer that finds no window, on a machine however busy
 
 
 @pytest.fixture(scope="module")
@@ -204,6 +205,7 @@ def test_where_no_viewer_opens_a_file_is_written_instead_and_said(
         monkeypatch.delenv(name, raising=False)
     if display is not None:
         monkeypatch.setenv("DISPLAY", display)  # which nobody serves
+        monkeypatch.setattr(viewer, "DIES_WITHIN_S", DIES_S)
     _, watch = watched(log, tmp_path)
     (shown,) = watch.shown
     assert shown.said.startswith(why)

@@ -91,6 +91,7 @@ def test_the_real_viewer_that_finds_no_window_is_noticed_though_it_listened(
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":987")  # which nobody serves
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(viewer, "DIES_WITHIN_S", LONG_S)
     assert refused([data]) < NO_WAIT_S
     said = viewer.show([data]).said
     assert said.startswith("The viewer stopped at once")
