@@ -60,7 +60,7 @@ class Config(Settings, frozen=True):
     """
 
     scheme: Literal["split", "paper"] | msgspec.UnsetType = msgspec.UNSET  # paper: as written there (`networks.paper_ode`)
-    curve_width: Width = 64  # units of each hidden layer of the curve: of 256, seeds scatter by half
+    curve_width: Width = 64  # units of each hidden layer of the curve; with 256 the seeds scatter half as much
     drift: tuple[Sensor, ...] = ("gyro",)  # sensors whose rest bias drifts
     drift_step_s: Positive = 0.25  # step of the solver
     solver: Literal["euler", "rk4", "dopri5"] = "euler"  # of the drift's ODE

@@ -17,7 +17,7 @@ from typing import Any
 from imutool import registry
 from imutool.conversion import Failure
 from imutool.conversion.corrections import CONVENTIONS, STAMPS
-from imutool.conversion.unread_formats import blamed, is_pointer, nothing_found, pointers_below
+from imutool.conversion.unread_formats import blamed, is_pointer, nothing_found, pointers_below, pointers_in
 from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, SUFFIX, ConvertReport, Job, Progress, check_targets, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
@@ -127,14 +127,15 @@ def _convert_found(
             for job, target in zip(source_sequences.jobs, targets, strict=True)
         ]
         if len(names) == 1 and source_sequences.errors:
-            raise blamed(source_sequences.errors[0][1], source)
+            raise blamed(source_sequences.errors[0][1], pointers_in(source))
         check_targets(jobs, source)
         outcomes = run_jobs(jobs, len(names), _worker_count(workers, len(jobs)), progress)
     failed = [(jobs[n].sequence.name, outcome.error) for n, outcome in sorted(outcomes.items()) if outcome.error is not None]
+    errors = [*source_sequences.errors, *failed]
+    pointers = pointers_in(source) if errors else []
     if len(names) == 1 and failed:
-        raise blamed(failed[0][1], source)
-    errors = ((name, blamed(error, source)) for name, error in [*source_sequences.errors, *failed])
-    report = ConvertReport(failures=[Failure(name, str(error)) for name, error in errors])
+        raise blamed(failed[0][1], pointers)
+    report = ConvertReport(failures=[Failure(name, str(blamed(error, pointers))) for name, error in errors])
     for number, outcome in sorted(outcomes.items()):
         if outcome.error is None:
             report.add(jobs[number].target, outcome)

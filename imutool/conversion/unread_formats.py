@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -99,21 +100,22 @@ def is_pointer(path: Path) -> bool:
 
 def pointers_below(folder: Path) -> list[str]:
     """Sentence on the pointers of Git LFS in a folder, which are left out; none without any."""
-    found = [path.name for path in _pointers(folder)]
+    found = [path.name for path in pointers_in(folder)]
     more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
     said = f"{', '.join(found[:MOST_NAMED])}{more}: pointers of Git LFS in place of the files are left out"
     return [f"{said}. {GET_FILES}"] if found else []
 
 
-def blamed(error: ImutoolError, source: Path) -> ImutoolError:
+def blamed(error: ImutoolError, pointers: Sequence[Path]) -> ImutoolError:
     """The error of a recording, or one that names the pointers of Git LFS of which it consists."""
     if not isinstance(error, DataError) or not error.where:
         return error
     where = Path(error.where)
-    return nothing_found(where, packed=False) if any(path.is_relative_to(where) for path in _pointers(source)) else error
+    return nothing_found(where, packed=False) if any(path.is_relative_to(where) for path in pointers) else error
 
 
-def _pointers(folder: Path) -> list[Path]:
+def pointers_in(folder: Path) -> list[Path]:
+    """Pointers of Git LFS among the first recordings in a folder."""
     paths = (Path(inside, name) for inside, _, files in os.walk(folder) for name in sorted(files))
     recorded = (path for path in paths if re.search(RECORDINGS, path.name.lower()))
     return [path for path in islice(recorded, MOST_FILES) if is_pointer(path)]

@@ -87,13 +87,18 @@ def test_units_axes_and_worlds_are_named_by_poses(number: int, flown: tuple[Imu,
     assert found.delay.seconds == pytest.approx(late_ns * 1e-9, abs=0.005)
 
 
+def misread(q_wxyz: np.ndarray, what: str) -> np.ndarray:
+    """Quaternions as a log has them that is read wrongly."""
+    rows, signs = MISREAD[what]
+    read = np.empty_like(q_wxyz)
+    read[:, rows] = q_wxyz * signs
+    return read
+
+
 @pytest.mark.parametrize("what", MISREAD)
 def test_misread_quaternions_of_poses_are_named_and_not_the_gyro(what: str, flown: tuple[Imu, Truth]) -> None:
     imu, truth = flown
-    rows, signs = MISREAD[what]
-    misread = np.empty_like(truth.q_wb_wxyz)
-    misread[:, rows] = truth.q_wb_wxyz * signs
-    assert judge(motion_of(imu), truth._replace(q_wb_wxyz=misread), 1.0).quaternions == what
+    assert judge(motion_of(imu), truth._replace(q_wb_wxyz=misread(truth.q_wb_wxyz, what)), 1.0).quaternions == what
     found = judge(motion_of(imu), truth, 1.0)
     assert found.quaternions == ""
     assert found.gyro is not None
@@ -106,15 +111,13 @@ def test_misread_quaternions_of_a_body_that_is_turned_against_the_gyro_are_named
     what: str, number: int, flown: tuple[Imu, Truth]
 ) -> None:
     imu, truth = flown
-    rows, signs = MISREAD[what]
-    misread = np.empty_like(truth.q_wb_wxyz)
-    misread[:, rows] = truth.q_wb_wxyz * signs
+    read = misread(truth.q_wb_wxyz, what)
     planted = Imu(imu.t_ns, imu.gyro @ PERMUTATIONS[number], imu.accel @ PERMUTATIONS[number])
-    found = judge(motion_of(planted), truth._replace(q_wb_wxyz=misread), 1.0)
+    found = judge(motion_of(planted), truth._replace(q_wb_wxyz=read), 1.0)
     assert found.quaternions
     assert found.gyro is not None
     rows, signs = MISREAD[found.quaternions]  # some readings are alike, up to a turn of the world
-    q = Rotation.from_quat(misread[:, rows] * signs, scalar_first=True)
+    q = Rotation.from_quat(read[:, rows] * signs, scalar_first=True)
     rate = (q[:-1].inv() * q[1:]).as_rotvec() * 1e9 / np.diff(truth.t_ns)[:, None]
     middle = 0.5 * (truth.t_ns[1:] + truth.t_ns[:-1])
     measured = np.stack([np.interp(middle, imu.t_ns, column) for column in (planted.gyro @ found.gyro.axes.T).T], axis=1)
@@ -131,11 +134,8 @@ def test_of_readings_of_quaternions_that_are_alike_the_positions_show_the_right_
     imu, truth = flown
     world = Rotation.from_matrix(np.eye(3) if up == "+z" else [[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     q_wxyz = (world * Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True)).as_quat(scalar_first=True)
-    rows, signs = MISREAD[what]
-    misread = np.empty_like(q_wxyz)
-    misread[:, rows] = q_wxyz * signs
     planted = Imu(imu.t_ns, imu.gyro @ PERMUTATIONS[number], imu.accel @ PERMUTATIONS[number])
-    found = judge(motion_of(planted), truth._replace(q_wb_wxyz=misread, p_wb=world.apply(truth.p_wb)), 1.0)
+    found = judge(motion_of(planted), truth._replace(q_wb_wxyz=misread(q_wxyz, what), p_wb=world.apply(truth.p_wb)), 1.0)
     assert (found.quaternions, found.up) == (what, up)
     assert found.gyro is not None
     np.testing.assert_array_equal(found.gyro.axes, PERMUTATIONS[number])
@@ -145,11 +145,9 @@ def test_of_readings_of_quaternions_that_are_alike_the_positions_show_the_right_
 def test_without_positions_gravity_shows_the_right_one_of_readings_that_are_alike(what: str, flown: tuple[Imu, Truth]) -> None:
     """Transposed matrices of a motion capture passed for w in the place of z, and --fix turned a world whose z was up."""
     imu, truth = flown
-    rows, signs = MISREAD[what]
-    misread = np.empty_like(truth.q_wb_wxyz)
-    misread[:, rows] = truth.q_wb_wxyz * signs
     on_its_back = Imu(imu.t_ns, imu.gyro * [1.0, -1.0, -1.0], imu.accel * [1.0, -1.0, -1.0])
-    found = judge(motion_of(on_its_back), truth._replace(q_wb_wxyz=misread, p_wb=np.zeros_like(truth.p_wb)), 1.0)
+    read = truth._replace(q_wb_wxyz=misread(truth.q_wb_wxyz, what), p_wb=np.zeros_like(truth.p_wb))
+    found = judge(motion_of(on_its_back), read, 1.0)
     assert found.quaternions == what
 
 
