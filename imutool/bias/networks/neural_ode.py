@@ -11,19 +11,24 @@ from collections.abc import Sequence
 from typing import ClassVar, TypeVar
 
 import msgspec
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from imutool.array_types import Float
+from imutool.array_types import Float, Int
 from imutool.bias.networks.network import BiasNetwork, LastLayer, Segment
 from imutool.bias.networks.ode import HermitePath, solve
 from imutool.bias.networks.paper_ode import BiasOde
 from imutool.bias.networks.perceptron import Drift, asinh, by_rows
 from imutool.bias.neural_ode import DRIFT_FILTER_S, HIDDEN, NEAR_ZERO, SLOW_S, Config, Model
 from imutool.config import Settings
+from imutool.errors import NumericsError
 from imutool.units import SENSORS, Sensor
 
 NEGLIGIBLE = 1e-15
+DRAWN = 512  # units of a layer of which a training keeps some
+ROWS = 4_096  # samples at which they are compared
+TINY = 1e-12  # share of the largest pivot below which a unit follows from others
 PAPER_WEIGHTS = 1e-3  # standard deviation at the start, as in the released code
 
 
@@ -42,7 +47,44 @@ class Curve(nn.Module):
             nn.init.normal_(layer.weight, 0.0, layer.in_features**-0.5)
         nn.init.zeros_(layers[2].weight)
         self.net = nn.Sequential(layers[0], nn.GELU(), layers[1], nn.Tanh(), layers[2])
+        self.prior_root = width**-0.5 * torch.eye(width, dtype=torch.float64)
         self.requires_grad_(False)  # the layers below stay as drawn, W and the last one are solved for in closed form
+
+    @torch.no_grad()
+    def keep_spanning(self, u: Float[Tensor, "n 3"], slow: Float[Tensor, "n 3"]) -> None:
+        """Draw wide hidden layers, and keep the units in which all others are nearly linear at some samples.
+
+        So the curve hardly depends on the draw, and its prior is that of all units.
+
+        Raises:
+            NumericsError: samples that are too large.
+        """
+        some = slice(None, None, -(-len(u) // ROWS))
+        seen = self._inputs(u[some], slow[some], torch.float64).cpu()
+        x = torch.cat([seen.new_zeros(1, 9), seen])  # the first row is no motion
+        if not bool(x.isfinite().all()):
+            raise NumericsError(
+                "samples overflow as inputs of the curve",
+                where="neural ODE",
+                expected="rates (gyro, rad/s) and forces (accel, m/s²) of a sensor",
+                fix="Look for absurd values in the logs with imutool info",
+            )
+        first, second = self.net[0], self.net[2]
+        width = max(DRAWN, len(self.prior_root))
+        wide_first, wide_second = nn.Linear(9, width).to(x), nn.Linear(width, width).to(x)
+        for layer in (wide_first, wide_second):
+            nn.init.normal_(layer.weight, 0.0, layer.in_features**-0.5)
+        bent = nn.functional.gelu(wide_first(x))
+        kept, by_kept = _spanning(bent - bent[0], bent - bent[0], first.out_features)
+        first.weight.copy_(wide_first.weight[kept])
+        first.bias.copy_(wide_first.bias[kept])
+        weight = wide_second.weight @ by_kept.mT
+        bias = wide_second.bias + wide_second.weight @ bent[0] - weight @ bent[0, kept]
+        units, all_units = torch.tanh(bent[:, kept] @ weight.mT + bias), torch.tanh(wide_second(bent))
+        kept, by_kept = _spanning(units - units[0], all_units - all_units[0], second.out_features)
+        second.weight.copy_(weight[kept])
+        second.bias.copy_(bias[kept])
+        self.prior_root = torch.linalg.qr(width**-0.5 * by_kept.mT).R.mT
 
     def forward(self, u: Float[Tensor, "*batch 3"], slow: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Motion-dependent bias: `u` the samples, `slow` the filtered ones."""
@@ -89,9 +131,11 @@ class Network(BiasNetwork):
         self.drift = nn.ModuleDict({sensor: drift for sensor, drift in drifts.items() if sensor in chosen.drifting})
 
     def see(self, gyro: Float[Tensor, "n 3"], accel: Float[Tensor, "n 3"]) -> None:
-        """Compute N in float32 from now on, in two fifths of the time; weights, and all else, stay float64."""
-        for sensor in self.curve:
-            _part(self.curve, sensor, Curve).precision = torch.float32
+        """Choose the units of N, and compute it in float32 from now on, in two fifths of the time; all else stays float64."""
+        for sensor, u in zip(self.curve, (gyro, accel), strict=not self.config.paper):
+            curve = _part(self.curve, sensor, Curve)
+            curve.keep_spanning(u, self._filtered(u[None], SLOW_S)[0])
+            curve.precision = torch.float32
 
     def take_loads(self, names: Sequence[str], theta: Float[Tensor, " p"]) -> None:
         """Take over a drift behind the load, fitted before; the samples of the training are corrected for it."""
@@ -126,7 +170,7 @@ class Network(BiasNetwork):
             u, _ = segment.of(sensor)
             return curve.hidden(u, self._filtered(u, SLOW_S))
 
-        return LastLayer(curve.W, last.weight, inputs)
+        return LastLayer(curve.W, last.weight, inputs, curve.prior_root)
 
     def rest_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
         """beta at each sample, linear between the steps of the drift; in the paper's scheme the whole bias."""
@@ -185,6 +229,24 @@ class _OnGrid(nn.Module):
         u, du = self.path.value(index), self.path.derivative(index) / self.step_s
         rate: Tensor = self.drift(beta, u, du)
         return self.step_s * rate
+
+
+def _spanning(
+    units: Float[Tensor, "n k"], wanted: Float[Tensor, "n m"], number: int
+) -> tuple[Int[Tensor, " number"], Float[Tensor, "number m"]]:
+    """Columns of `units` that span them, by pivots, and the coefficients with which they come nearest to `wanted`.
+
+    With scipy, because PyTorch's least squares round otherwise from call to call.
+    """
+    from scipy.linalg import qr, solve_triangular  # a network that is only drawn needs no scipy
+
+    columns = units.numpy()
+    kept = np.sort(qr(columns, mode="r", pivoting=True)[1][:number])
+    Q, R, order = qr(columns[:, kept], mode="economic", pivoting=True)
+    rank = int((np.abs(R.diagonal()) > TINY * np.abs(R[0, 0])).sum())
+    coefficients = np.zeros((number, wanted.shape[1]))
+    coefficients[order[:rank]] = solve_triangular(R[:rank, :rank], Q[:, :rank].T @ wanted.numpy())
+    return torch.from_numpy(kept).long(), torch.from_numpy(coefficients)
 
 
 def _skipped(last: nn.Module) -> bool:

@@ -23,7 +23,7 @@ from imutool.training.calibration.normal_equations import TINY, Seen, Terms, lin
 from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 
-WEIGHT_PRIOR = 2.4  # of a weight, over the root of their number, in the unit of the curve: chosen by left-out logs of FETCH
+WEIGHT_PRIOR = 2.4  # factor of the prior's root of the weights, in the unit of the curve: chosen by left-out logs of FETCH
 
 
 @torch.no_grad()
@@ -45,9 +45,10 @@ def solve_last_layer(model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float
         inputs.append(layer.inputs(whole)[0])
         if sensor == "accel":
             gyro[rows] -= model.sensor_bias("gyro", whole)[0]
-    values = torch.cat([pool.of_sensor(sensor), torch.cat(inputs)], dim=1)
+    root = layer.prior_root.to(gyro)
+    values = torch.cat([pool.of_sensor(sensor), torch.cat(inputs) @ root], dim=1)
     width = values.shape[1]
-    std = torch.full((3, width), WEIGHT_PRIOR / (width - 3) ** 0.5).to(values)
+    std = torch.full((3, width), WEIGHT_PRIOR).to(values)
     std[:, :3] = W_PRIOR
     by_axis = torch.eye(3 * width).to(values).reshape(3, width, 3 * width)
     problem = linearise(Seen(pool, sensor, gyro), Terms(values, by_axis, std.flatten() ** -2.0), "train")
@@ -57,7 +58,7 @@ def solve_last_layer(model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float
         return
     theta = problem.solve_by_scatter(every).theta.reshape(3, width)
     layer.W.copy_(theta[:, :3])
-    layer.out.copy_(theta[:, 3:])
+    layer.out.copy_(theta[:, 3:] @ root.mT)
 
 
 def _is_surely_less(new: Float[Tensor, " logs"], loss: Float[Tensor, " logs"]) -> bool:
