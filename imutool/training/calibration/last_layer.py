@@ -13,6 +13,7 @@ Source of features that are drawn: Rahimi and Recht, "Random features for large-
 from __future__ import annotations
 
 import torch
+from scipy.special import ndtr, stdtrit
 from torch import Tensor
 
 from imutool.array_types import Float
@@ -62,6 +63,12 @@ def solve_last_layer(model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float
 
 
 def _is_surely_less(new: Float[Tensor, " logs"], loss: Float[Tensor, " logs"]) -> bool:
-    """Whether losses of logs are less beyond their scatter; never of one log, which others do not predict."""
+    """Whether losses of logs are less beyond their scatter; never of one log, which others do not predict.
+
+    A scatter of few logs is uncertain itself, so the standard errors are Student's.
+    """
     gain = (loss.clamp_min(TINY) / new.clamp_min(TINY)).log()
-    return len(gain) > 1 and float(gain.mean()) > max(LEAST_GAIN, SURELY * float(gain.std()) / len(gain) ** 0.5)
+    if len(gain) < 2:
+        return False
+    surely = float(stdtrit(len(gain) - 1, ndtr(SURELY)))
+    return float(gain.mean()) > max(LEAST_GAIN, surely * float(gain.std()) / len(gain) ** 0.5)
