@@ -208,6 +208,31 @@ def test_a_training_computes_the_curve_in_float32(build: MakeModel, seen: Segmen
         assert not coarse.requires_grad, "the curve is solved for, not descended on"
 
 
+def test_with_units_kept_of_many_the_seed_hardly_decides_which_curves_are_likely() -> None:
+    u = torch.tensor([0.05, 0.05, 0.5]) * torch.randn(2_000, 3, generator=torch.Generator().manual_seed(0)).double()
+    scatter = []
+    for kept in (False, True):
+        covariances = []
+        for seed in (4, 5, 6):
+            torch.manual_seed(seed)
+            model = Network(Config(), RATE_HZ).double()
+            if kept:
+                model.see(u, u)
+            curve = model.curve.get_submodule("gyro")
+            assert isinstance(curve, Curve)
+            root = curve.hidden(u[::10], u[::10]).double() @ curve.prior_root
+            covariances.append(root @ root.mT)
+        of_seeds = torch.stack(covariances)
+        scatter.append(float(of_seeds.std(0).norm() / of_seeds.mean(0).norm()))
+    assert scatter[1] < 0.6 * scatter[0], scatter
+
+
+def test_units_of_a_sensor_that_does_not_move_are_kept_without_a_number_that_is_none() -> None:
+    model = Network(Config(curve_width=8), RATE_HZ).double()
+    model.see(torch.zeros(50, 3).double(), torch.zeros(50, 3).double())
+    assert all(bool(value.isfinite().all()) for value in model.state_dict().values())
+
+
 def test_an_untrained_model_adds_nothing(seen: Segment) -> None:
     """The networks begin at zero, so a descent begins at the closed form."""
     torch.manual_seed(0)

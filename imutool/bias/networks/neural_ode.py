@@ -245,7 +245,8 @@ def _spanning(
     Q, R, order = qr(columns[:, kept], mode="economic", pivoting=True)
     rank = int((np.abs(R.diagonal()) > TINY * np.abs(R[0, 0])).sum())
     coefficients = np.zeros((number, wanted.shape[1]))
-    coefficients[order[:rank]] = solve_triangular(R[:rank, :rank], Q[:, :rank].T @ wanted.numpy())
+    if rank:
+        coefficients[order[:rank]] = solve_triangular(R[:rank, :rank], Q[:, :rank].T @ wanted.numpy())
     return torch.from_numpy(kept).long(), torch.from_numpy(coefficients)
 
 
