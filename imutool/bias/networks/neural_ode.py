@@ -69,7 +69,7 @@ class Curve(nn.Module):
                 expected="rates (gyro, rad/s) and forces (accel, m/s²) of a sensor",
                 fix="Look for absurd values in the logs with imutool info",
             )
-        first, second = self.net[0], self.net[2]
+        first, second = _part(self.net, "0", nn.Linear), _part(self.net, "2", nn.Linear)
         width = max(DRAWN, len(self.prior_root))
         wide_first, wide_second = nn.Linear(9, width).to(x), nn.Linear(width, width).to(x)
         for layer in (wide_first, wide_second):

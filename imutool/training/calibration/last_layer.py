@@ -71,4 +71,4 @@ def _is_surely_less(new: Float[Tensor, " logs"], loss: Float[Tensor, " logs"]) -
     if len(gain) < 2:
         return False
     surely = float(stdtrit(len(gain) - 1, ndtr(SURELY)))
-    return float(gain.mean()) > max(LEAST_GAIN, surely * float(gain.std()) / len(gain) ** 0.5)
+    return bool(gain.mean() > max(LEAST_GAIN, surely * float(gain.std()) / len(gain) ** 0.5))
