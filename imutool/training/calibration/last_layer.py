@@ -1,4 +1,4 @@
-"""Curve of the motion in closed form, W u + V x, behind layers that stay as they were drawn.
+"""Curve of the motion in closed form, W u + V x, behind layers that were drawn.
 
 The curve is linear in W and V. A descent on batches ends about their minimum, where the noise of the batches takes
 combinations that the motion hardly shows to and fro. Least squares have one minimum, and features that were drawn predict
