@@ -11,8 +11,11 @@ a small matrix for each log and time puts K z_0 in the place of its amplitude.
 
 from __future__ import annotations
 
+import copy
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -25,6 +28,7 @@ from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.temperature import online_signals
 from imutool.bias_start.earlier_load import EARLIER_S, PRIOR, loads_after
 from imutool.bias_start.fitness import head
+from imutool.bias_start.stretches import measured_recording, read_stretches
 from imutool.geometry import so3
 from imutool.inertial.strapdown import truth_velocity
 from imutool.recording import Poses, Recording, nanoseconds, seconds
@@ -40,11 +44,57 @@ from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Pool
 from imutool.units import AXES, Sensor
 
+LEAST_PART_S = 60.0  # of each log, where all are too much
 TRIADS_RAD = 5e-3  # plausible rotation between the gyro and the accelerometer of one chip
 OFF_DIAGONAL, DIAGONAL = (1, 2, 3, 5, 6, 7), (0, 4, 8)  # of a 3x3 matrix, row by row
 COLD = 0  # index of the time zero
 SWEEPS = 5
 CLEAR = 10.0  # of twice the log-likelihood, by which different times beat one for all (as BIC: Kass and Raftery 1995)
+
+logger = logging.getLogger(__name__)
+
+
+def read_parts(
+    logs: Sequence[Path], most_samples: int, *, imu: str | None = None, truth: str | None = None
+) -> list[tuple[Path, Recording]]:
+    """Measurements of logs, and of each stretch of their clocks, of at most so many samples.
+
+    Of the longest only the first seconds are kept. Where a minute of each would be too much, every other log is left out.
+
+    Raises:
+        ConfigError, LogError, DataError: a log without IMU or measurements.
+    """
+    left, parts, cut = list(logs), list[tuple[Path, Recording]](), set[Path]()
+    while left:
+        log = left.pop(0)
+        parts += [(log, measured_recording(part)) for part in read_stretches(log, imu=imu, truth=truth)]
+        most = _most_of_each(parts, most_samples)
+        while most * parts[0][1].imu.period_s < LEAST_PART_S and len(parts) > 1:
+            left, parts = left[len(parts) % 2 :: 2], parts[::2]
+            most = _most_of_each(parts, most_samples)
+        for k, (path, part) in enumerate(parts):
+            if len(part.imu) > most:
+                first = part.between(int(part.imu.t_ns[0]), int(part.imu.t_ns[most - 1]))
+                parts[k] = path, copy.deepcopy(first)  # without the rest in memory
+                cut.add(path)
+    used = {path: part.imu.duration_s for path, part in parts}
+    told = [f"only {len(used)} of {len(logs)} logs are used"] * (len(used) < len(set(logs)))
+    if shorter := [used[path] for path in cut & used.keys()]:
+        told.append(f"only the first {max(shorter):.0f} s of long logs")
+    if told:
+        logger.warning("%s: a sample takes 3 kB of memory; --set most_samples=N takes more", ", and ".join(told))
+    return parts
+
+
+def _most_of_each(parts: Sequence[tuple[Path, Recording]], most: int) -> int:
+    """Number of samples to which longer parts have to be cut for a sum of at most `most`."""
+    left = most
+    for k, count in enumerate(sorted(len(part.imu) for _, part in parts)):
+        level = left // (len(parts) - k)
+        if count > level:
+            return level
+        left -= count
+    return most
 
 
 def turned_alike(

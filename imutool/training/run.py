@@ -21,7 +21,7 @@ from imutool.bias.model import BiasModel
 from imutool.bias.networks import neural_ode as neural_ode_network
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.threads import settings_of_a_new_process, side_by_side
-from imutool.bias_start.stretches import measured_recording, read_stretches, within_range
+from imutool.bias_start.stretches import within_range
 from imutool.config import plain
 from imutool.errors import ConfigError
 from imutool.log_info.convention_report import check_conventions
@@ -34,7 +34,7 @@ from imutool.training.calibration.log_scatter import LEAST_GAIN, SURELY
 from imutool.training.candidates import left_out_covariance, simpler_effects
 from imutool.training.fit import Epoch, Training, check_device, note
 from imutool.training.left_out import LEAST_ERROR, beaten, compare
-from imutool.training.log_signals import matrix_covariance, with_poses_of_sensor
+from imutool.training.log_signals import matrix_covariance, read_parts, with_poses_of_sensor
 from imutool.training.objectives.paper_scheme import PaperTraining
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.training.training_windows import Pool, check_trainable
@@ -90,7 +90,7 @@ def train(
         raise ConfigError(f"{method} has no steps to go on with", where="resume", fix="Train it without `resume`")
     if method == hybrid.Model.method:
         config_of(chosen)  # a misspelt setting is an error before any log is read
-    parts = [(log, measured_recording(part)) for log in logs for part in read_stretches(log, imu=imu, truth=truth)]
+    parts = read_parts(logs, chosen.most_samples, imu=imu, truth=truth)
     check_conventions(part for _, part in parts)
     recordings = [within_range(part) for _, part in parts]
     for recording in (recording for recording in recordings if recording.truth_caveat):

@@ -112,6 +112,7 @@ class TrainSettings(Settings, frozen=True):
     weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-4  # of AdamW
     track_knot_s: Positive = 20.0  # between knots of each log's own slow bias, which the training estimates beside the weights
     validate_every: Count = 100  # steps between two lines of progress, each with a checkpoint
+    most_samples: Count = 1_000_000  # of all logs together, each from its start: one takes 3 kB of memory
     compare: bool = True  # linear and hybrid: score left-out logs, and keep the simplest model that is not beaten
     increments: IncrementSettings = IncrementSettings()
     paper: PaperSettings = PaperSettings()

@@ -27,7 +27,7 @@ from imutool.sensor.made_up_flight import flight
 from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.calibration.effect_selection import config_of
 from imutool.training.fit import Epoch, TrainSettings
-from imutool.training.log_signals import TRIADS_RAD
+from imutool.training.log_signals import TRIADS_RAD, read_parts
 from imutool.training.objectives.objective import AdamW, WindowEndObjective
 from imutool.training.run import checkpoint_path, helps, train
 from imutool.training.settings import settings_from_physics, settings_of
@@ -478,3 +478,20 @@ def test_samples_at_the_end_of_the_gyros_range_teach_no_scale(tmp_path: Path, ca
         errors[share] = evaluate(tmp_path / "1.0.mcap", models=[tmp_path / f"{share}.safetensors"], init="truth")[1]["aoe_deg"]
     assert errors[0.7] < 1.5 * errors[1.0] + 0.2
     assert "at the end of its range, and are left out" in caplog.text
+
+
+def test_long_logs_are_cut_to_what_memory_holds(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    logs = [tmp_path / f"{seed}.mcap" for seed in range(5)]
+    for seed, (log, duration_s) in enumerate(zip(logs, (8.0, 70.0, 90.0, 90.0, 70.0), strict=True)):
+        write(flight(seed, duration_s=duration_s, rate_hz=100.0), log)
+    parts = [part for _, part in read_parts(logs[:3], 13_000)]
+    assert [len(part.imu) for part in parts] == [801, 6_099, 6_099]
+    assert all(part.imu.gyro.base is None for part in parts[1:]), "the rest of a log is not kept in memory"
+    assert all(part.truth.t_ns[-1] <= part.imu.t_ns[-1] for part in parts[1:])
+    found = read_parts(logs[1:], 14_100)
+    assert [(path, len(part.imu)) for path, part in found] == [(logs[1], 7_001), (logs[3], 7_099)], "a minute of each, at least"
+    assert [len(part.imu) for _, part in read_parts(logs[2:3], 500)] == [500]
+    assert len(read_parts(logs[:3], 16_804)) == 3
+    first = ("only the first 61 s of long logs", "only 2 of 4 logs are used, and only the first 71 s of long logs")
+    said = ": a sample takes 3 kB of memory; --set most_samples=N takes more"
+    assert caplog.messages == [text + said for text in (*first, "only the first 5 s of long logs")]
