@@ -17,6 +17,8 @@ from imutool.array_types import Float, Int
 from imutool.bias.networks.threads import of_each
 from imutool.units import Sensor
 
+PIECE_S = 300.0  # of a log, in which its rest bias counts as constant
+WANDER = {"gyro": 5e-4, "accel": 0.02}  # rad/s, m/s²: of the rest bias from piece to piece, a choice
 REST_PRIOR = {"gyro": 0.1, "accel": 1.0}  # rad/s, m/s²: plausible turn-on biases
 NUISANCE_STD = {  # how far they differ from log to log, at most
     "gyro": (0.01,) * 3 + (5e-3,),  # rotation (rad), clock (s)
@@ -108,6 +110,37 @@ def shared_by_scatter(
         size = (USUAL_SQUARES + share * float(square[shown].sum())) / (USUAL_SQUARES - 2.0 + share * int(shown.sum()))
     covariance = torch.linalg.inv(P + S / size) if len(theta) else S
     return theta - covariance @ (prior * theta + v / size), covariance
+
+
+class LogPieces(NamedTuple):
+    """Pieces of the logs in which the rest bias may count as constant: of each sample, and the log of each."""
+
+    of_sample: Int[Tensor, " n"]
+    log: Int[Tensor, " pieces"]
+
+    @classmethod
+    def of(cls, log: Int[Tensor, " n"], t: Float[Tensor, " n"], logs: int) -> LogPieces:
+        """Pieces of logs, from the log and the time of each sample."""
+        began, ended = (torch.stack([edge(t[log == i]) for i in range(logs)]) for edge in (torch.amin, torch.amax))
+        count = ((ended - began) / PIECE_S).ceil().clamp_min(1.0).long()
+        share = (t - began[log]) / (ended - began).clamp_min(LEAST_VARIANCE)[log]
+        before = torch.cumsum(count, 0) - count
+        piece = before[log] + (share * count[log]).long().clamp_max(count[log] - 1)
+        return cls(piece, torch.repeat_interleave(torch.arange(logs).to(log), count))
+
+    def merged(
+        self, H: Float[Tensor, "pieces k k"], g: Float[Tensor, "pieces k"], c: Float[Tensor, " pieces"], sensor: Sensor, p: int
+    ) -> tuple[Float[Tensor, "logs k k"], Float[Tensor, "logs k"], Float[Tensor, " logs"]]:
+        """Losses of the logs, with what the rest bias of a piece differs from that of its log integrated out.
+
+        The rest bias follows p parameters. That of a log in one piece is the log's.
+        """
+        wandering = (torch.bincount(self.log)[self.log] > 1).to(H)
+        rest, X = slice(p, p + 3), torch.cat([H, g[..., None]], dim=2)[:, p : p + 3]
+        y = torch.linalg.solve(H[:, rest, rest] + torch.eye(3).to(H) / WANDER[sensor] ** 2, X) * wandering[:, None, None]
+        H, g, c = H - X[..., :-1].mT @ y[..., :-1], g - (X[..., :-1].mT @ y[..., -1:])[..., 0], c - (X * y)[..., -1].sum(1)
+        H, g, c = (x.new_zeros(int(self.log[-1]) + 1, *x.shape[1:]).index_add(0, self.log, x) for x in (H, g, c))
+        return H, g, c
 
 
 def sums_by_log(

@@ -26,7 +26,14 @@ from imutool.inertial.windows import HUBER_MEDIANS, Pieces, Prefix, derivative_b
 from imutool.sensor.linear_form import LinearForm, patterns, terms_of
 from imutool.sensor.signals import Signals
 from imutool.training.calibration.closed_form import end_samples, median_per_log, nuisance_jacobian, window_sets
-from imutool.training.calibration.log_scatter import integrated, shared_by_scatter, shown_by_logs, sums_by_log, widest
+from imutool.training.calibration.log_scatter import (
+    LogPieces,
+    integrated,
+    shared_by_scatter,
+    shown_by_logs,
+    sums_by_log,
+    widest,
+)
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Part, Pool
 from imutool.units import Sensor
@@ -211,17 +218,19 @@ def linearise(seen: Seen, terms: Terms, part: Part, own_prior: Float[Tensor, " o
     width = widest(seen.sensor, prior) if own_prior is None else own_prior
     theta, own, settled = torch.zeros_like(prior), prior.new_zeros(logs, len(width)), False
     pieces, turned = Pieces.between([windows[:2] for windows in sets], PIECE), dict[int, Tensor]()
-    samples = seen.pool.of_sensor(seen.sensor)
+    samples, split = seen.pool.of_sensor(seen.sensor), LogPieces.of(seen.pool.log, seen.pool.t, logs)
     rows, unknowns = [pieces.row(windows.first, windows.n) for windows in sets], len(prior) + len(width)
+    nothing = Equations(*(prior.new_zeros(len(split.log), *shape) for shape in ((unknowns, unknowns), (unknowns,), ())))
     for step in range(len(sets) + MOST_STEPS):
-        fit = judged = Equations(*(prior.new_zeros(logs, *shape) for shape in ((unknowns, unknowns), (unknowns,), ())))
+        fit = judged = nothing
         size = seen.pool.least(seen.sensor)
         true_u = samples - terms.values @ torch.einsum("iqp,p->qi", terms.pattern, theta) - own[seen.pool.log, :3]
         prefix = _prefix(seen, pieces, terms, true_u, turned)
         for windows, row in list(zip(sets, rows, strict=True))[: step + 1]:
-            equations, size = _equations(seen, windows, prefix.across(*row), true_u, own, size)
+            equations, size = _equations(seen, windows, prefix.across(*row), true_u, own, size, split)
             fit = fit + equations
             judged = judged + equations if windows.judged else judged
+        fit, judged = (Equations(*split.merged(some.H, some.g, some.c, seen.sensor, len(prior))) for some in (fit, judged))
         if own_prior is None and step >= len(sets) - 1:
             width = shown_by_logs(seen.sensor, fit.H, fit.g, theta, own, prior)
         held = prior * (1.0 if step >= len(sets) else WEAK)
@@ -265,11 +274,9 @@ def _equations(
     true_u: Float[Tensor, "n 3"],
     own: Float[Tensor, "logs o"],
     shorter: Float[Tensor, " logs"],
+    split: LogPieces,
 ) -> tuple[Equations, Float[Tensor, " logs"]]:
-    """Normal equations of the windows of one length, and their usual residual.
-
-    `crossed` is what `Prefix.across` says of them, `shorter` the usual residual of shorter windows.
-    """
+    """Normal equations of windows of one length, by piece, and their usual residual; `shorter` is that of shorter windows."""
     pool, (turn, added) = seen.pool, crossed
     index = end_samples(windows.first, windows.n)
     ends = pool.at(index, own.new_zeros(len(index), 6))
@@ -282,17 +289,10 @@ def _equations(
         by_nuisance = nuisance_jacobian("accel", ends, seen.gyro[index], true_u[index])
     e = e + (by_nuisance @ own[ends.log, 3:, None])[..., 0]
     slopes = torch.cat([by_shared, by_nuisance], dim=2)
-    equations, usual = _summed(e, slopes, ends.log, shorter)
-    return equations.times(1.0 / design_effect(pool)), usual
-
-
-def _summed(
-    e: Float[Tensor, "m 3"], J: Float[Tensor, "m 3 k"], log: Int[Tensor, " m"], shorter: Float[Tensor, " logs"]
-) -> tuple[Equations, Float[Tensor, " logs"]]:
-    """Normal equations with Huber's weights, in units of each log's median residual; and these medians."""
     # errors add up: a median below that of shorter windows comes from so few that a log's own unknowns fit their noise
     size = e.norm(dim=1)
-    usual = median_per_log(size, log, shorter)
-    delta = HUBER_MEDIANS * usual[log]
+    usual = median_per_log(size, ends.log, shorter)
+    delta = HUBER_MEDIANS * usual[ends.log]
     weight = huber_weight(size, delta) * 3 / delta**2 / REPEATED
-    return Equations(*sums_by_log(J, e, weight, log, len(shorter))), usual
+    sums = sums_by_log(slopes, e, weight, split.of_sample[windows.first], len(split.log))
+    return Equations(*sums).times(1.0 / design_effect(pool)), usual

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
-from imutool.training.calibration.log_scatter import USUAL_SQUARES
+from imutool.sensor.made_up_flight import flight
+from imutool.training.calibration import log_scatter
+from imutool.training.calibration.effect_selection import calibrate
+from imutool.training.calibration.log_scatter import USUAL_SQUARES, WANDER, LogPieces
 from imutool.training.calibration.normal_equations import Equations, Problem
+from imutool.training.training_windows import Pool
 
 LOGS, SHARED, OWN, DRAWS = 4, 5, 2, 200
 ROUNDING = 1e-10
@@ -164,3 +169,39 @@ def test_a_log_on_its_own_counts_in_full(data: Data) -> None:
     expected = replace(alone._of([0], 2.0), design_effect=1.0).solve(range(SHARED))
     torch.testing.assert_close(alone.solve_by_scatter(range(SHARED)).covariance, expected.covariance, rtol=0, atol=ROUNDING)
     assert made.solve_by_scatter([]).covariance.shape == (0, 0)
+
+
+def test_pieces_of_a_log_differ_in_their_rest_bias(data: Data) -> None:
+    """The loss of a log is that of its pieces with the best differences, and a log in one piece keeps its own."""
+    log = torch.tensor([0] * 4 + [1] * 3)
+    split = LogPieces.of(log, torch.tensor([0.0, 100.0, 310.0, 350.0, 0.0, 100.0, 299.0]).double(), 2)
+    assert split.of_sample.tolist() == [0, 0, 1, 1, 2, 2, 2]
+    assert split.log.tolist() == [0, 0, 1]
+    wide, p, rest = 4, 1, slice(1, 4)
+    losses = [(J[:, :wide], r) for J, r in data[: len(split.log)]]
+    H, g, c = (torch.stack(parts) for parts in zip(*((J.T @ J, J.T @ r, r @ r) for J, r in losses), strict=True))
+    merged = split.merged(H, g, c, "gyro", p)
+    assert torch.equal(merged[0][1], H[2])
+    assert merged[2][1] == c[2]
+    at, least = torch.tensor([0.3, -0.2, 0.1, 0.4]).double(), 0.0
+    for J, r in losses[:2]:
+        e, by_rest = J @ at + r, J[:, rest]
+        ridge = torch.eye(3).double() / WANDER["gyro"] ** 2
+        off = -torch.linalg.solve(by_rest.T @ by_rest + ridge, by_rest.T @ e)
+        least += float((e + by_rest @ off).square().sum() + off @ ridge @ off)
+    found = merged[2][0] + 2.0 * merged[1][0] @ at + at @ merged[0][0] @ at
+    assert float(found) == pytest.approx(least, rel=ROUNDING)
+
+
+def test_a_bias_that_wanders_over_a_long_log_is_no_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Made-up sensors warm up with a time constant of 20 s, and their bias wanders."""
+    logs = [flight(seed, duration_s=900.0, rate_hz=50.0) for seed in (3, 4)]
+    still = [log.scalars["/ground_truth/bias/gyro"].values for log in logs]
+    warm_up = np.mean([bias[0] - bias[100 * 50] for bias in still], axis=0)  # but for a share of 7e-3, and the wander
+    pool, errors = Pool.of(logs), []
+    for piece_s in (1e9, log_scatter.PIECE_S):
+        monkeypatch.setattr(log_scatter, "PIECE_S", piece_s)
+        fit = calibrate(pool, "gyro", pool.gyro, ("gyro_scale", "gyro_misalignment", "gyro_warm_up"), "all")
+        found = fit.theta[-9:].reshape(3, 3).numpy()  # for each axis those of 5, 20 and 80 s
+        errors.append(np.abs(found + np.outer(warm_up, [0.0, 1.0, 0.0])).mean())
+    assert errors[1] < 0.7 * errors[0], errors
