@@ -113,7 +113,7 @@ def shared_by_scatter(
 
 
 class LogPieces(NamedTuple):
-    """Pieces of the logs in which the rest bias may count as constant: of each sample, and the log of each."""
+    """Pieces of logs, each with a rest bias of its own: that of each sample, and the log of each."""
 
     of_sample: Int[Tensor, " n"]
     log: Int[Tensor, " pieces"]
