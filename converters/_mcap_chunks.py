@@ -9,6 +9,7 @@ import zlib
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator
+from io import BytesIO
 from struct import Struct
 from typing import Any, BinaryIO
 
@@ -151,7 +152,6 @@ def in_order(reader: Any, file: BinaryIO) -> Iterator[tuple[Any, Any, Message]]:
     """
     from mcap.data_stream import ReadDataStream
     from mcap.records import Chunk
-    from mcap.stream_reader import get_chunk_data_stream
 
     summary, waiting = summary_of(reader, file), list[_Waiting]()
     for start_ns, at, size in sorted(Content(summary, file).blocks):
@@ -163,11 +163,32 @@ def in_order(reader: Any, file: BinaryIO) -> Iterator[tuple[Any, Any, Message]]:
             data = file.read(size)
         else:
             file.seek(at + RECORD_HEAD)
-            stream, unpacked = get_chunk_data_stream(Chunk.read(ReadDataStream(file)), validate_crc=True)
-            data = stream.read(unpacked)
+            data = _unpacked(Chunk.read(ReadDataStream(file)))
         waiting += _messages_in(data, at)
         waiting.sort()
     yield from (_defined(summary, record) for record in waiting)
+
+
+def _unpacked(chunk: Any) -> bytes:
+    """Records of a chunk, whose data may be several frames in a row: the library reads the first alone.
+
+    Raises:
+        ValueError: data of another size or CRC than the chunk states.
+    """
+    import lz4.frame
+    import zstandard
+
+    data, size = chunk.data, chunk.uncompressed_size
+    if chunk.compression == "zstd":
+        data = zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True).read(size + 1)
+    elif chunk.compression == "lz4":
+        first = lz4.frame.decompress(data)  # takes a fifth of the time of the class that goes on
+        data = first if len(first) == size else lz4.frame.LZ4FrameFile(BytesIO(data)).read(size + 1)
+    elif chunk.compression:
+        raise ValueError(f"a chunk is compressed with {chunk.compression!r}")
+    if len(data) != size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise ValueError(f"the contents of a chunk of {size} bytes have another size or CRC than it states")
+    return bytes(data)
 
 
 def _messages_in(data: bytes, at: int) -> Iterator[_Waiting]:
