@@ -8,7 +8,7 @@ from __future__ import annotations
 import zlib
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from io import BytesIO
 from struct import Struct
 from typing import Any, BinaryIO
@@ -46,6 +46,11 @@ def summary_of(reader: Any, file: BinaryIO) -> Any:
     return summary
 
 
+def listed(records: Mapping[int, int]) -> str:
+    """Counts of records by their opcodes, for a message."""
+    return ", ".join(f"{count} of 0x{opcode:02x}" for opcode, count in sorted(records.items()))
+
+
 class Content:
     """Content of a log's data section, which need not be in its summary.
 
@@ -75,10 +80,9 @@ class Content:
                 take[opcode](at, size)
             elif opcode > DATA_END:
                 others[opcode] += 1
-        kinds = ", ".join(f"{count} of 0x{opcode:02x}" for opcode, count in sorted(others.items()))
         losses = {
             "attachments are not carried over": ", ".join(self._attachments),
-            "records that are none of MCAP's own are not carried over": kinds,
+            "records that are none of MCAP's own are not carried over": listed(others),
             "metadata of one name are joined, and later values replace others": ", ".join(self._replaced),
         }
         self.losses = [f"{what}: {which}" for what, which in losses.items() if which]
@@ -145,10 +149,10 @@ def _crc(file: BinaryIO, end: int) -> int:
     return crc
 
 
-def in_order(reader: Any, file: BinaryIO) -> Iterator[tuple[Any, Any, Message]]:
+def in_order(reader: Any, file: BinaryIO, others: Counter[int]) -> Iterator[tuple[Any, Any, Message]]:
     """Schema, channel and content of each message, in order of log time, then of the file.
 
-    Chunks are sorted as they come, in place of a heap of single messages.
+    Chunks are sorted as they come, in place of a heap of single messages. `others` counts records that are none of MCAP's own.
     """
     from mcap.data_stream import ReadDataStream
     from mcap.records import Chunk
@@ -164,7 +168,7 @@ def in_order(reader: Any, file: BinaryIO) -> Iterator[tuple[Any, Any, Message]]:
         else:
             file.seek(at + RECORD_HEAD)
             data = _unpacked(Chunk.read(ReadDataStream(file)))
-        waiting += _messages_in(data, at)
+        waiting += _messages_in(data, at, others)
         waiting.sort()
     yield from (_defined(summary, record) for record in waiting)
 
@@ -191,7 +195,7 @@ def _unpacked(chunk: Any) -> bytes:
     return bytes(data)
 
 
-def _messages_in(data: bytes, at: int) -> Iterator[_Waiting]:
+def _messages_in(data: bytes, at: int, others: Counter[int]) -> Iterator[_Waiting]:
     """Messages of a chunk or a run; the library's own records take three times as long.
 
     Raises:
@@ -207,6 +211,8 @@ def _messages_in(data: bytes, at: int) -> Iterator[_Waiting]:
             channel, _, log_time, publish_time = MESSAGE_HEAD.unpack_from(data, place)
             yield log_time, at, number, channel, publish_time, data[place + MESSAGE_HEAD.size : place + length]
             number += 1
+        elif opcode > DATA_END:
+            others[opcode] += 1
         place += length
 
 

@@ -19,15 +19,15 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._mcap_chunks import MAGIC, RECORD_HEAD, Content, in_order, summary_of
+from ._mcap_chunks import MAGIC, RECORD_HEAD, Content, in_order, listed, summary_of
 from ._ros_types import plain_cdr
 from ._source import find_files, find_folders, head, name, with_suffix
 
 GENERAL = True
-IMUS = r"sensor_msgs/msg/Imu|px4_msgs/msg/(Sensor|Vehicle).*"  # PX4 has parts of an IMU in messages of their own
 METADATA = "metadata.yaml"  # of a ROS 2 bag, which its recorder writes last
 PART = r"(.*)_(\d+)"  # name of a part of a ROS 2 bag
 MOST_PAUSE_NS = 10 * 10**9  # between the parts of one recording, which a recorder splits as it goes
+AHEAD = "cdr"  # encoding whose topics are defined ahead of their messages, as two may be joined; others may need a message
 Define = Callable[[MessageTopic], MessageTopic]
 IMAGES = r"(sensor_msgs/(msg/)?|foxglove\.)(CompressedImage|Image|RawImage)"
 
@@ -83,25 +83,22 @@ def read_sequence(sequence: Sequence, *, images: bool = True, define: Define = a
         for number, channel in summary.channels.items():
             schema = summary.schemas.get(channel.schema_id)
             if images or not re.fullmatch(IMAGES, schema.name if schema else ""):
-                if schema is not None and _may_be_imu(schema.name, channel.message_encoding):
+                if channel.message_encoding == AHEAD:
                     topics.append(define(_topic(schema, channel)))
                 if summary.statistics is not None:
                     counts[channel.topic] = counts.get(channel.topic, 0) + of_channel.get(number, 0)
+        silent = ", ".join(sorted({*(topic for topic, count in counts.items() if not count)} - {t.name for t in topics}))
+        remarks = Remarks([*content.notes, *[f"topics without messages are left out: {silent}"][: len(silent)]], content.losses)
         own = {**content.metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
     return MessageLog(
         sequence.name,
         sequence.path.name,
         topics=tuple(topics),
-        messages=partial(_messages, sequence.path, images, define),
+        messages=partial(_messages, sequence.path, images, define, remarks),
         counts=counts,
         metadata={"imutool": own, **content.metadata},
-        remarks=Remarks(content.notes, content.losses),
+        remarks=remarks,
     )
-
-
-def _may_be_imu(schema_name: str, encoding: str) -> bool:
-    """Whether messages are an IMU or a part of one: their topics are defined ahead of them, as two may be joined."""
-    return encoding == "cdr" and bool(re.fullmatch(IMUS, schema_name))
 
 
 def read(source: Path) -> Iterator[MessageLog]:
@@ -211,7 +208,7 @@ def read_parts(
             found = tuple(dict.fromkeys(message.topic for message in messages()))
             what = f"{path.name} was not finished: it is read up to its last whole chunk, at byte"
             remarks.losses.append(f"{what} {_whole_size(path)} of {path.stat().st_size}")
-        topics |= {topic.name: topic for topic in found if _may_be_imu(topic.schema_name, topic.message_encoding)} | topics
+        topics |= {topic.name: topic for topic in found if topic.message_encoding == AHEAD} | topics
         sources.append(messages)
     return MessageLog(
         sequence.name,
@@ -268,16 +265,20 @@ def _reader(file: Any) -> Any:
     return make_reader(file, validate_crcs=True)
 
 
-def _messages(path: Path, images: bool, define: Define = as_defined) -> Iterator[Message]:
-    """Messages in log-time order."""
+def _messages(path: Path, images: bool, define: Define = as_defined, remarks: Remarks | None = None) -> Iterator[Message]:
+    """Messages in log-time order; what else chunks hold goes to the remarks."""
     topics: dict[int, MessageTopic] = {}
+    others = Counter[int]()
     with _refusing(path), path.open("rb") as file:
-        for schema, channel, message in in_order(_reader(file), file):
+        for schema, channel, message in in_order(_reader(file), file, others):
             topic = topics.get(channel.id)
             if topic is None:
                 topic = topics[channel.id] = define(_topic(schema, channel))
             if images or not re.fullmatch(IMAGES, topic.schema_name):
                 yield message._replace(topic=topic, payload=_plain(topic, message.payload))
+    loss = f"records in chunks that are none of MCAP's own are not carried over: {listed(others)}"
+    if others and remarks is not None and loss not in remarks.losses:
+        remarks.losses.append(loss)
 
 
 def _plain(topic: MessageTopic, payload: bytes | memoryview) -> bytes | memoryview:
