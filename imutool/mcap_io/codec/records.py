@@ -179,7 +179,7 @@ def _decompress(compression: str, packed: memoryview, size: int) -> bytes | memo
         context = lz4.frame.create_decompression_context()  # `LZ4FrameDecompressor` would copy the packed bytes first
         data, read, ended = lz4.frame.decompress_chunk(context, packed, max_length=size)
         if ended and read < len(packed) and len(data) < size:
-            return lz4.frame.LZ4FrameFile(BytesIO(packed)).read(size + 1)
+            return bytes(lz4.frame.LZ4FrameFile(BytesIO(packed)).read(size + 1))
         if not ended and lz4.frame.decompress_chunk(context, packed[read:], max_length=1)[0]:
             raise ValueError(f"the lz4 frame goes on beyond the chunk's {size} bytes")
         return data
