@@ -24,10 +24,10 @@ from ._ros_types import plain_cdr
 from ._source import find_files, find_folders, head, name, with_suffix
 
 GENERAL = True
+IMUS = r"sensor_msgs/msg/Imu|px4_msgs/msg/(Sensor|Vehicle).*"  # PX4 has parts of an IMU in messages of their own
 METADATA = "metadata.yaml"  # of a ROS 2 bag, which its recorder writes last
 PART = r"(.*)_(\d+)"  # name of a part of a ROS 2 bag
 MOST_PAUSE_NS = 10 * 10**9  # between the parts of one recording, which a recorder splits as it goes
-AHEAD = "cdr"  # encoding whose topics are defined ahead of their messages, as two may be joined; others may need a message
 Define = Callable[[MessageTopic], MessageTopic]
 IMAGES = r"(sensor_msgs/(msg/)?|foxglove\.)(CompressedImage|Image|RawImage)"
 
@@ -79,16 +79,17 @@ def read_sequence(sequence: Sequence, *, images: bool = True, define: Define = a
         content = Content(summary, file)
         of_channel = summary.statistics.channel_message_counts if summary.statistics is not None else {}
         counts: dict[str, int] = {}
-        topics: list[MessageTopic] = []
-        for number, channel in summary.channels.items():
-            schema = summary.schemas.get(channel.schema_id)
-            if images or not re.fullmatch(IMAGES, schema.name if schema else ""):
-                if channel.message_encoding == AHEAD:
-                    topics.append(define(_topic(schema, channel)))
-                if summary.statistics is not None:
-                    counts[channel.topic] = counts.get(channel.topic, 0) + of_channel.get(number, 0)
-        silent = ", ".join(sorted({*(topic for topic, count in counts.items() if not count)} - {t.name for t in topics}))
-        remarks = Remarks([*content.notes, *[f"topics without messages are left out: {silent}"][: len(silent)]], content.losses)
+        channels = [(summary.schemas.get(channel.schema_id), channel) for channel in summary.channels.values()]
+        channels = [(s, channel) for s, channel in channels if images or not re.fullmatch(IMAGES, s.name if s else "")]
+        for _, channel in channels if summary.statistics is not None else []:
+            counts[channel.topic] = counts.get(channel.topic, 0) + of_channel.get(channel.id, 0)
+        topics, silent = list[MessageTopic](), {topic for topic, count in counts.items() if not count}
+        for schema, channel in channels:
+            if _may_be_imu(schema, channel) or (channel.message_encoding == "cdr" and channel.topic in silent):
+                topics.append(define(_topic(schema, channel)))
+                silent.discard(channel.topic)
+        left_out = f"topics without messages are left out: {', '.join(sorted(silent))}"
+        remarks = Remarks([*content.notes, *[left_out][: len(silent)]], content.losses)
         own = {**content.metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
     return MessageLog(
         sequence.name,
@@ -99,6 +100,11 @@ def read_sequence(sequence: Sequence, *, images: bool = True, define: Define = a
         metadata={"imutool": own, **content.metadata},
         remarks=remarks,
     )
+
+
+def _may_be_imu(schema: Any, channel: Any) -> bool:
+    """Whether messages are an IMU or a part of one: their topics are defined ahead of them, as two may be joined."""
+    return schema is not None and channel.message_encoding == "cdr" and bool(re.fullmatch(IMUS, schema.name))
 
 
 def read(source: Path) -> Iterator[MessageLog]:
@@ -202,13 +208,13 @@ def read_parts(
             counts.update(part.counts)
             for name, values in part.metadata.items():
                 metadata.setdefault(name, {}).update(values)
-            found, messages = part.topics, part.messages
+            found, messages = part.topics, partial(_messages, path, images, define, remarks)
         else:
             messages = partial(_unfinished, path, images)
             found = tuple(dict.fromkeys(message.topic for message in messages()))
             what = f"{path.name} was not finished: it is read up to its last whole chunk, at byte"
             remarks.losses.append(f"{what} {_whole_size(path)} of {path.stat().st_size}")
-        topics |= {topic.name: topic for topic in found if topic.message_encoding == AHEAD} | topics
+        topics |= {topic.name: topic for topic in found if topic.message_encoding == "cdr"} | topics
         sources.append(messages)
     return MessageLog(
         sequence.name,

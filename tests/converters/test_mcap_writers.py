@@ -132,6 +132,7 @@ def test_topics_without_messages_are_kept_or_named(convert, tmp_path):
         writer.start("ros2")
         schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data")
         writer.register_channel("/never", "cdr", schema)
+        writer.register_channel("/sent", "cdr", writer.register_schema("std_msgs/msg/Float32", "ros2msg", b"float32 data"))
         writer.register_channel("/silent", "json", writer.register_schema("Text", "jsonschema", b"{}"))
         writer.add_message(writer.register_channel("/sent", "cdr", schema), 1, b"\0\1\0\0" + bytes(8), 1)
         writer.finish()
