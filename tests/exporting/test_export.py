@@ -296,6 +296,18 @@ def test_images_pass_through_one_at_a_time(tmp_path: Path) -> None:
     assert peak < 20 * IMAGE_BYTES  # of 60; a chunk holds several
 
 
+def test_a_camera_without_a_number_takes_no_other_s_folder(tmp_path: Path) -> None:
+    """A camera of another name was written as cam0, with the sensor.yaml of that, which was left out."""
+    frames = {f"/{name}/image_raw/compressed": images(count) for name, count in (("cam1", 2), ("front", 3), ("cam0", 4))}
+    write(Recording("made", whole().imu, frames=frames), tmp_path / "log.mcap")
+    report = export(tmp_path / "log.mcap", tmp_path / "out", format="euroc")
+    assert {name: report.written[f"cam{n}/data.csv"] for n, name in enumerate(("cam0", "cam1", "front"))} == {
+        "cam0": 4,
+        "cam1": 2,
+        "front": 3,
+    }
+
+
 # ── rosbag2 ──
 
 
