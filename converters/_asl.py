@@ -22,6 +22,9 @@ IMU = "imu0"
 IMU_TOPIC = "/imu0"
 QUATERNION_TOLERANCE = 1e-2  # printed with six decimals the norm is off by 3e-4 at most in EuRoC; more is not a rotation
 REPEATED = "{} poses with a repeated stamp dropped, the first kept"
+OF_DATASETS = "leica", "pointcloud", "vicon"  # sensors that EuRoC's folders have beside IMU, poses and cameras
+NO_POSES = "not read: holds no full poses"
+OTHER_SENSOR = f"is left out: of such a folder {IMU}, poses and cameras are read; its data.csv can be converted by itself"
 IMAGE_FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 
 
@@ -63,7 +66,7 @@ def recording(
         "imutool": identity(dataset, sequence, sensor, known),
     }
     metadata.update({name: {"text": content[name].decode("utf-8", "backslashreplace")} for name in texts})
-    notes: dict[str, dict[str, str]] = {"imutool/repairs": {}, "imutool/skipped": {}}
+    notes: dict[str, dict[str, str]] = {"imutool/repairs": {}, "imutool/skipped": {}, "imutool/losses": {}}
     samples = imu(_table.parse(content.pop(tables[IMU]), tree.where(tables[IMU]), "imu"))
     poses: dict[str, Poses] = {}
     scalars: dict[str, Scalars] = {}
@@ -81,7 +84,8 @@ def recording(
             frames[f"/{camera}/image_raw/compressed"] = found
     for other in sorted(set(tree.sensors()) - {IMU, *folders, *cameras}):
         if images or not other.startswith("cam"):
-            notes["imutool/skipped"][other] = "not read: holds no full poses"
+            of_dataset = other.startswith(("cam", *OF_DATASETS))
+            notes["imutool/skipped" if of_dataset else "imutool/losses"][other] = NO_POSES if of_dataset else OTHER_SENSOR
     metadata.update({name: note for name, note in notes.items() if note})
     return Recording(sequence.name, samples, poses, scalars, frames, metadata, IMU_TOPIC, sequence.path.name)
 

@@ -2,12 +2,12 @@
 
 The stamps are those of the message headers. Raw images (`sensor_msgs/Image`) and positions without orientation
 (`PointStamped`) are not carried over; the metadata record `imutool/skipped` names them. A bag that its recorder did not
-finish, or that is cut, has no index: what can be read of it is converted, and `imutool/repairs` says so.
+finish, or that is cut, has no index: what can be read of it is converted, and `imutool/losses` says so, and which topics the
+data set does not have.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache, partial
@@ -25,8 +25,6 @@ from ._ros_types import ros2_name
 from ._source import is_bag
 from ._table import Table
 
-logger = logging.getLogger(__name__)
-
 IMU = "sensor_msgs/msg/Imu"
 POSES = ("geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry")
 IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -34,6 +32,7 @@ SKIPPED = {
     "sensor_msgs/msg/Image": "raw images are not carried over, only CompressedImage",
     "geometry_msgs/msg/PointStamped": "a position without orientation is no pose",
 }
+NOT_OF_DATASET = "is left out, as the data set has no such topic; `format=ros1_bag` keeps every topic"
 
 
 def topics(path: Path) -> dict[str, str]:
@@ -96,6 +95,9 @@ def recording(
     pose_topics = sorted(wanted, key=lambda t: (t not in truths, t))
     skipped = {topic: SKIPPED[kind] for topic, kind in kinds.items() if kind in SKIPPED}
     named = {_asl.IMU_TOPIC: imu_topic}
+    taken = {imu_topic, *pose_topics, *skipped}
+    losses = {"bag": wrong} if wrong else {}
+    losses |= {topic: NOT_OF_DATASET for topic, kind in kinds.items() if topic not in taken and kind != IMAGE}
     repairs: dict[str, str] = {}
     poses: dict[str, Poses] = {}
     scalars: dict[str, Scalars] = {}
@@ -105,14 +107,12 @@ def recording(
         named[target] = topic
         if repeated := _asl.add_truth(table, target, poses, scalars):
             repairs[target] = _asl.REPEATED.format(repeated)
-    if wrong:
-        logger.warning("%s: %s", sequence.path, wrong)
-        repairs["bag"] = wrong
     metadata = {
         "imutool": _asl.identity(dataset, sequence, sensor, known),
         "imutool/topics": named,
         **({"imutool/repairs": repairs} if repairs else {}),
         **({"imutool/skipped": skipped} if skipped else {}),
+        **({"imutool/losses": losses} if losses else {}),
     }
     frames = {topic: _frames(sequence.path, topic) for topic, kind in kinds.items() if images and kind == IMAGE}
     return Recording(
@@ -135,6 +135,7 @@ def _imu_topic(path: Path, candidates: list[str]) -> str:
             f"has {len(candidates)} IMU topics ({', '.join(candidates) or 'none'})",
             where=path,
             expected="one, or /imu0",
+            fix="`format=ros1_bag` reads any bag" if candidates else "",
         )
     return candidates[0]
 

@@ -36,6 +36,9 @@ UNITS = {
 MULTIPLES = {  # of a unit, by their names
     r"mrads?( ?/ ?s(ec)?)|milliradians?( ?/ ?| per )s(ec(ond)?)?": (1e-3, "rad/s"),
     r"(deg(ree)?s?|°)( ?/ ?| per )h(r|our)?": (1.0 / 3600.0, "deg/s"),
+    r"(deg(ree)?s?|°)( ?/ ?| per )min(ute)?": (1.0 / 60.0, "deg/s"),
+    r"rpm|(rev(olution)?s?|turns?)( ?/ ?| per )min(ute)?": (6.0, "deg/s"),
+    r"(rev(olution)?s?|turns?)( ?/ ?| per )s(ec(ond)?)?": (360.0, "deg/s"),
     r"mm/s((\^|\*\*)?2|²)": (1e-3, "m/s^2"),
     r"[uµμ]g|micro-?gs?": (1e-6, "g"),
 }
@@ -183,8 +186,8 @@ def unit_with_factor(column: str, beside: str) -> tuple[float, str]:
     if found := next((multiple for named, multiple in MULTIPLES.items() if re.fullmatch(named, text)), None):
         return found
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?(?:[eE]-?\d+)?)\s*[*·x]?\s*(\D.*)", inside[1] if inside else beside)
-    unit = unit_named(match[2].strip()) if match else ""
-    return (float(match[1]), unit) if match and unit else (1.0, "")
+    unit, factor = (unit_named(match[2].strip()), float(match[1])) if match else ("", 1.0)
+    return (factor, unit) if unit and 0.0 < factor < 1.0 else (1.0, "")  # a larger one may be a range: `acc_x (16 g)`
 
 
 def spaced_name(column: str) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 
-from ._table_names import unit_with_factor
+from ._table_names import split_name, triples, unit_with_factor
 from ._table_text import Columns
 
 MAG = ["mag_x", "mag_y", "mag_z"]
@@ -40,10 +40,11 @@ def of_vectornav(text: str, columns: Columns) -> str:
 
 def scale_stated(columns: Columns) -> None:
     """Multiply columns whose header states a multiple of a unit: `gyro x (0.1 deg/s)`."""
-    scaled = []
+    scaled, names = [], {column: split_name(column)[0] for column in columns.values}
+    rates = {column for axes in triples("gyro", names).values() for column in axes.values()}
     for column, values in columns.values.items():
         factor, unit = unit_with_factor(column, columns.units.get(column, ""))
-        if unit and 0.0 < factor < 1.0:  # a larger one may be a range: `acc_x (16 g)`
+        if unit and (factor < 1.0 or column in rates):  # a motor's revolutions stay
             columns.values[column], columns.units[column] = values.astype(float) * factor, unit
             columns.texts.pop(column, None)
             scaled.append(f"{column} by {factor:g} to {unit}")

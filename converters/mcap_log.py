@@ -19,7 +19,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._mcap_chunks import MAGIC, RECORD_HEAD, Content, in_order, summary_of
+from ._mcap_chunks import MAGIC, RECORD_HEAD, Content, in_order, listed, summary_of
 from ._ros_types import plain_cdr
 from ._source import find_files, find_folders, head, name, with_suffix
 
@@ -79,29 +79,32 @@ def read_sequence(sequence: Sequence, *, images: bool = True, define: Define = a
         content = Content(summary, file)
         of_channel = summary.statistics.channel_message_counts if summary.statistics is not None else {}
         counts: dict[str, int] = {}
-        topics: list[MessageTopic] = []
-        for number, channel in summary.channels.items():
-            schema = summary.schemas.get(channel.schema_id)
-            if images or not re.fullmatch(IMAGES, schema.name if schema else ""):
-                if schema is not None and _may_be_imu(schema.name, channel.message_encoding):
-                    topics.append(define(_topic(schema, channel)))
-                if summary.statistics is not None:
-                    counts[channel.topic] = counts.get(channel.topic, 0) + of_channel.get(number, 0)
+        channels = [(summary.schemas.get(channel.schema_id), channel) for channel in summary.channels.values()]
+        channels = [(s, channel) for s, channel in channels if images or not re.fullmatch(IMAGES, s.name if s else "")]
+        for _, channel in channels if summary.statistics is not None else []:
+            counts[channel.topic] = counts.get(channel.topic, 0) + of_channel.get(channel.id, 0)
+        topics, silent = list[MessageTopic](), {topic for topic, count in counts.items() if not count}
+        for schema, channel in channels:
+            if _may_be_imu(schema, channel) or (channel.message_encoding == "cdr" and channel.topic in silent):
+                topics.append(define(_topic(schema, channel)))
+                silent.discard(channel.topic)
+        left_out = f"topics without messages are left out: {', '.join(sorted(silent))}"
+        remarks = Remarks([*content.notes, *[left_out][: len(silent)]], content.losses)
         own = {**content.metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
     return MessageLog(
         sequence.name,
         sequence.path.name,
         topics=tuple(topics),
-        messages=partial(_messages, sequence.path, images, define),
+        messages=partial(_messages, sequence.path, images, define, remarks),
         counts=counts,
         metadata={"imutool": own, **content.metadata},
-        remarks=Remarks(content.notes, content.losses),
+        remarks=remarks,
     )
 
 
-def _may_be_imu(schema_name: str, encoding: str) -> bool:
+def _may_be_imu(schema: Any, channel: Any) -> bool:
     """Whether messages are an IMU or a part of one: their topics are defined ahead of them, as two may be joined."""
-    return encoding == "cdr" and bool(re.fullmatch(IMUS, schema_name))
+    return schema is not None and channel.message_encoding == "cdr" and bool(re.fullmatch(IMUS, schema.name))
 
 
 def read(source: Path) -> Iterator[MessageLog]:
@@ -205,13 +208,13 @@ def read_parts(
             counts.update(part.counts)
             for name, values in part.metadata.items():
                 metadata.setdefault(name, {}).update(values)
-            found, messages = part.topics, part.messages
+            found, messages = part.topics, partial(_messages, path, images, define, remarks)
         else:
             messages = partial(_unfinished, path, images)
             found = tuple(dict.fromkeys(message.topic for message in messages()))
             what = f"{path.name} was not finished: it is read up to its last whole chunk, at byte"
             remarks.losses.append(f"{what} {_whole_size(path)} of {path.stat().st_size}")
-        topics |= {topic.name: topic for topic in found if _may_be_imu(topic.schema_name, topic.message_encoding)} | topics
+        topics |= {topic.name: topic for topic in found if topic.message_encoding == "cdr"} | topics
         sources.append(messages)
     return MessageLog(
         sequence.name,
@@ -268,16 +271,20 @@ def _reader(file: Any) -> Any:
     return make_reader(file, validate_crcs=True)
 
 
-def _messages(path: Path, images: bool, define: Define = as_defined) -> Iterator[Message]:
-    """Messages in log-time order."""
+def _messages(path: Path, images: bool, define: Define = as_defined, remarks: Remarks | None = None) -> Iterator[Message]:
+    """Messages in log-time order; what else chunks hold goes to the remarks."""
     topics: dict[int, MessageTopic] = {}
+    others = Counter[int]()
     with _refusing(path), path.open("rb") as file:
-        for schema, channel, message in in_order(_reader(file), file):
+        for schema, channel, message in in_order(_reader(file), file, others):
             topic = topics.get(channel.id)
             if topic is None:
                 topic = topics[channel.id] = define(_topic(schema, channel))
             if images or not re.fullmatch(IMAGES, topic.schema_name):
                 yield message._replace(topic=topic, payload=_plain(topic, message.payload))
+    loss = f"records in chunks that are none of MCAP's own are not carried over: {listed(others)}"
+    if others and remarks is not None and loss not in remarks.losses:
+        remarks.losses.append(loss)
 
 
 def _plain(topic: MessageTopic, payload: bytes | memoryview) -> bytes | memoryview:

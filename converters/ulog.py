@@ -69,6 +69,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     if unstamped := sum(int((columns["timestamp"] == 0).sum()) for columns in topics.values()):
         remarks.notes.append(f"messages that PX4 gave no stamp: {unstamped}; they are logged at the start of the log")
     poses = poses_of(topics, remarks)
+    start_ns = 1000 * ulog.start_timestamp if ulog.start_timestamp < LATEST_US else 0  # damaged
     texts = [(m.timestamp * 1000, m.log_level_str(), m.message) for m in ulog.logged_messages if m.timestamp < LATEST_US]
     if len(texts) < len(ulog.logged_messages):
         remarks.losses.append(f"texts with an impossible time: {len(ulog.logged_messages) - len(texts)}")
@@ -79,7 +80,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         messages=partial(logged, texts),
         imus=imus_of(topics, remarks),
         poses=poses,
-        tables={f"/{name}": table_of(name, columns, 1000 * ulog.start_timestamp) for name, columns in topics.items()},
+        tables={f"/{name}": table_of(name, columns, start_ns) for name, columns in topics.items()},
         kinds={topic: "truth" if topic.startswith("/ground_truth") else "estimate" for topic in poses},
         metadata=_metadata(sequence, ulog),
         remarks=remarks,

@@ -165,6 +165,8 @@ def reason(error: Exception) -> str:
         return "files of this kind of URL can only be read"
     if isinstance(error, PermissionError):
         return redact(f"the store refuses access: {error}")
+    if "range requests" in str(error):  # what else the library says is for programs
+        return "the server sends files as a whole and no part of one: fetch it first"
     return redact(str(error)) or type(error).__name__
 
 

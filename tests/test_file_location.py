@@ -272,6 +272,16 @@ def test_a_web_server_s_log_is_debiased_as_the_file_is_under_its_own_name(logs: 
     assert report.rewrite.added == debias(file, tmp_path / "b.mcap", model=model).rewrite.added
 
 
+def test_a_web_server_that_sends_no_parts_is_named(tmp_path: Path) -> None:
+    """The message advised an argument of the library."""
+    (tmp_path / "large.mcap").write_bytes(bytes(9 * MIB))  # of more than two blocks
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(tmp_path))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with pytest.raises(LogError, match="sends files as a whole and no part of one: fetch it first"):
+            Source(to_location(f"http://127.0.0.1:{server.server_port}/large.mcap")).at(8 * MIB, 100)
+        server.shutdown()
+
+
 @pytest.mark.parametrize("words", [["train", "-o", "m.safetensors"], ["diagnose"]])
 def test_a_log_that_is_given_twice_is_refused(imutool: Any, tmp_path: Path, logs: Path, words: list[str]) -> None:
     """Its samples counted twice: deviations became too small, and a left-out log was trained on."""

@@ -122,7 +122,7 @@ def _tell(report: ConvertReport, common: Common) -> None:
         for note in [*_grouped(report.notes), *asked]:
             tell_warning(note, "note")
     for loss in _grouped(report.losses):
-        tell_warning(loss)
+        tell_warning(with_flags(loss))
     told: set[str] = set()
     for failure in report.failures:
         first, _, others = failure.message.partition("\n")

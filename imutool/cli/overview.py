@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from copy import copy
+from shutil import get_terminal_size
+from typing import Any
 
+NARROW = 80  # columns: with fewer, the tables of a command's help cut the names of options
 # A test compares names and texts with the commands themselves. The order is that of the page.
 COMMANDS: Mapping[str, tuple[str, str]] = {  # by name: the module, and the first line of the command's help
     "convert": ("convert", "Convert any recording with an IMU to MCAP; the format is recognised."),
@@ -35,6 +40,14 @@ OPTIONS = {
     "--show-completion": "Show completion for the current shell, to copy it or customize the installation.",
     "--help": "Show this message and exit.",
 }
+
+
+def fitted(command: Any) -> Any:
+    """Copy of a command for its help: without tables and markup in a narrow terminal."""
+    shown = copy(command)
+    if get_terminal_size().columns < NARROW:
+        shown.rich_markup_mode, shown.epilog = None, re.sub(r"\[(bold|/)\]", "", command.epilog or "")
+    return shown
 
 
 def show() -> None:

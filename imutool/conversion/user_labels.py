@@ -55,7 +55,7 @@ class Labels:
         topics = [name for name, kind in types.items() if kind == schemas.IMU]
         if isinstance(content, Recording) or not set(parts) <= set(topics):
             named, expected = " and ".join(parts), ", ".join(topics) or "a bag or a log with IMU topics"
-            are_vectors = all(types.get(part) == schemas.VECTOR3 for part in parts)
+            are_vectors = all(types.get(part) in schemas.VECTORS for part in parts)
             fix = "Convert without `imu`: other commands join these vectors by it" if are_vectors else ""
             raise ConfigError(f"no IMU messages to join on {named}", where="imu", expected=expected, fix=fix)
         return replace(content, pairs={whole_of(parts): parts})

@@ -180,7 +180,7 @@ def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
         raise ConfigError(labelled.remarks.doubts[0], where=str(job.sequence))
     if isinstance(labelled, Recording):
         write(labelled, job.target, compression=job.compression, overwrite=job.overwrite)
-        return Outcome()
+        return Outcome(None, _said(labelled, "skipped", "repairs"), _said(labelled, "losses"))
     write_log(labelled, job.target, compression=job.compression, overwrite=job.overwrite)
     with Log(job.target) as log:
         joined = JOIN_VECTORS if len(log.with_schema((schemas.VECTOR3,))) > 1 else ""
@@ -189,6 +189,12 @@ def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
     stated = [f"{name}: {found.units}, by the comments of its definition" for name, found in own.items() if found.units]
     notes = *filter(None, [job.said]), *labelled.remarks.notes, *stated, *lacking
     return Outcome(None, notes, tuple(labelled.remarks.losses), mapping=labelled.metadata.get(MAP, {}))
+
+
+def _said(recording: Recording, *names: str) -> tuple[str, ...]:
+    """Sentences of a recording's records on what of its source is not in it, or otherwise."""
+    records = (recording.metadata.get(f"imutool/{name}", {}) for name in names)
+    return tuple(f"{place}: {what}" for record in records for place, what in record.items())
 
 
 def _run_in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]:

@@ -6,6 +6,7 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from itertools import count
 from pathlib import Path
 from typing import TextIO
 
@@ -227,9 +228,10 @@ class _Asl:
 
     def cameras(self) -> None:
         """Writes one folder per camera, images byte for byte, one in memory at a time."""
-        for number, (topic, frames) in enumerate(self.recording.frames.items()):
-            named = re.match(r"/(cam\d+)/", topic)
-            folder = named[1] if named else f"cam{number}"
+        named = {topic: found[1] for topic in self.recording.frames if (found := re.match(r"/(cam\d+)/", topic))}
+        free = (folder for number in count() if (folder := f"cam{number}") not in named.values())
+        for topic, frames in self.recording.frames.items():
+            folder = named.get(topic) or next(free)
             if frames.count and f"{folder}/data.csv" not in self.written:
                 self._camera(folder, topic, frames)
                 self.used.add(topic)

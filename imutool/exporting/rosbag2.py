@@ -104,7 +104,7 @@ def _metadata_yaml(log: Log, name: str) -> str:
         text += (
             "    - topic_metadata:\n"
             f"        name: {_quoted(topic.name)}\n"
-            f"        type: {_quoted(topic.schema_name)}\n"
+            f"        type: {_quoted(topic.own_schema or topic.schema_name)}\n"
             "        serialization_format: cdr\n"
             f"        offered_qos_profiles: {_quoted(_qos(topic.metadata.get('offered_qos_profiles', '')))}\n"
             f"      message_count: {topic.count}\n"

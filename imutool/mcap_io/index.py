@@ -137,7 +137,9 @@ class LogIndex:
             return messages.parse(raw, block.offset)
         data = records.unpack(raw, block.offset, self.max_chunk, block.head(raw))
         offsets = message_offsets(self.source, block, len(data)) if len(data) > SMALL else None
-        return (None if offsets is None else messages.parse_at(data, offsets)) or messages.parse(data, block.offset)
+        found = (None if offsets is None else messages.parse_at(data, offsets)) or messages.parse(data, block.offset)
+        block.trusted &= offsets is None or np.array_equal(offsets, found.offsets)  # an index may list some messages alone
+        return found
 
     def entries(self, block: MessageBlock, channel: int) -> UInt64[np.ndarray, "n 2"]:
         """The message index of one channel of a block."""
@@ -151,8 +153,7 @@ class LogIndex:
             raise LogError("the file is empty", expected="an MCAP log")
         start = source.at(0, min(len(MAGIC), source.size))
         if start != MAGIC[: len(start)]:
-            what = f"this is not an MCAP log: it starts with {start!r}"
-            raise LogError(what, expected=repr(MAGIC), fix=CONVERT)
+            raise LogError(f"this is not an MCAP log: it starts with {start!r}", expected=repr(MAGIC), fix=CONVERT)
         at = source.size - len(MAGIC) - FOOTER_SIZE
         if at < len(MAGIC) or source.at(source.size - len(MAGIC), len(MAGIC)) != MAGIC:
             raise cut_short(source)
@@ -214,8 +215,7 @@ class LogIndex:
         if opcode != Opcode.HEADER or length > limit - position - HEAD.size:
             raise LogError(f"the record at byte {position} is {records.name_of(opcode)}", expected="a whole Header")
         self.header: Header = records.parse(Header, source.at(position + HEAD.size, length), position)
-        position += HEAD.size + length
-        self.header_end = position
+        self.header_end = position = position + HEAD.size + length
         while position < limit:
             if (known := chunks.get(position)) is not None:
                 self.items.append(block := MessageBlock.of_summary(known, limit))

@@ -151,7 +151,7 @@ class Log:
             LogError: no such topic, other messages, or another encoding.
         """
         if (parts := parse_parts(name)) is not None:
-            return self._join(*(self.topic(part, (schemas.IMU, schemas.VECTOR3)) for part in parts))
+            return self._join(*(self.topic(part, (schemas.IMU, *schemas.VECTORS)) for part in parts))
         if name not in self.topics:
             raise LogError(f"there is no topic {name}", where=self.path, expected=self.listing())
         found = self.topics[name]

@@ -108,8 +108,8 @@ class Topic:
         Raises:
             LogError: a payload that is no such message.
         """
-        if self.schema_name == schemas.VECTOR3:
-            yield from (Vectors(part.stamp_ns, part.values, part.frame_id) for part in self.decode_scalars(rows))
+        if (at := schemas.VECTORS.get(self.schema_name)) is not None:
+            yield from (Vectors(part.stamp_ns, part.values[:, at], part.frame_id) for part in self.decode_scalars(rows))
         else:
             yield from (Vectors(part.stamp_ns, getattr(part, sensor), part.frame_id) for part in self.decode_imu(rows))
 

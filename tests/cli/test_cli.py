@@ -125,6 +125,19 @@ def test_every_help_has_an_example(code: Code, capsys: pytest.CaptureFixture[str
     assert max(map(len, printed.splitlines())) <= 80
 
 
+@pytest.mark.parametrize("command", ["convert", "live", "view"])
+def test_help_in_a_narrow_terminal_has_whole_names(
+    code: Code, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """At 40 columns --compression was --compr…"""
+    monkeypatch.setenv("COLUMNS", "40")
+    assert code(command, "--help") == 0
+    printed = capsys.readouterr().out
+    assert f"Example: imutool {command} " in printed
+    assert not re.search(r"--[a-z-]*…", printed)
+    assert "[/]" not in printed
+
+
 @pytest.mark.parametrize(("command", "group"), [("train", "imutool.bias"), ("convert", "imutool.converters")])
 def test_help_lists_what_can_be_named_with_its_summary(
     code: Code, capsys: pytest.CaptureFixture[str], command: str, group: str

@@ -219,6 +219,9 @@ def test_settings_of_the_sensors_and_what_was_not_read_are_kept_as_metadata(make
     assert recording.metadata["body.yaml"]["text"] == "comment: made up\n"
     assert recording.metadata["imutool"] == {"format": "euroc", "sequence": "one"}
     assert list(recording.metadata["imutool/skipped"]) == ["leica0"]
+    assert "imutool/losses" not in recording.metadata
+    (other,) = euroc.read(make.folder("two", {**files, "mav0/imu1/data.csv": files["mav0/imu0/data.csv"]}))
+    assert "is left out: of such a folder imu0" in other.metadata["imutool/losses"]["imu1"]
 
 
 @pytest.mark.parametrize("form", ["folder", "zip", "tar", "tar.gz"])

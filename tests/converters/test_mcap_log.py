@@ -16,10 +16,14 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from imutool.conversion.run import convert as convert_logs
 from imutool.converters import mcap_log
+from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.flatbuffer import FlatBuffer
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
+from imutool.mcap_io.write import write
+from imutool.recording import Imu, Recording
 
 BFBS = b64decode(json.loads((Path(__file__).parents[1] / "fixtures" / "flatbuffer.json").read_text())["bfbs"])
 START_NS = 1_600_000_000_000_000_123
@@ -315,3 +319,20 @@ def test_a_record_that_does_not_fit_its_chunk_is_refused(convert, tmp_path, leng
     assert done.returncode == 4, done.stderr
     assert f"a record of {length} bytes in a chunk" in done.stderr
     assert "imutool repair" in done.stderr
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_chunk_of_several_frames_is_read_and_converted(tmp_path, monkeypatch, compression):
+    """Both formats allow frames in a row, as parallel compressors write them; such a log counted as damaged."""
+    whole = records.pack(compression)
+
+    def frames(data: bytes) -> bytes:
+        return b"".join(whole(data[at : at + 5000]) for at in range(0, len(data), 5000))
+
+    t_ns = START_NS + 10_000_000 * np.arange(COUNT)
+    with monkeypatch.context() as patch:
+        patch.setattr(records, "pack", lambda _: frames)
+        write(Recording("x", Imu(t_ns, GYRO, ACCEL)), tmp_path / "in.mcap", compression=compression)
+    convert_logs(tmp_path / "in.mcap", tmp_path / "out.mcap")
+    for log in ("in.mcap", "out.mcap"):
+        np.testing.assert_array_equal(read(tmp_path / log).imu.gyro, GYRO)

@@ -96,13 +96,14 @@ def test_what_no_index_lists_is_converted_or_said(convert, tmp_path, statistics)
     t_ns = T_NS + (T_NS[-1] - T_NS[0] + 5_000_000)
     rows, later = encode_imu(t_ns, GYRO, ACCEL, "imu"), t_ns.tolist()
     more = [build(Message(1, t, row.tobytes(), t, 0)) for t, row in zip(later, rows, strict=True)]
-    unlisted = b"".join(more[100:])
+    unlisted = b"".join([*more[100:], b"\x90" + bytes(8)])
     chunk = Chunk("", unlisted, later[-1], later[100], 0, len(unlisted))
     rig = [build(Metadata("rig", {"mount": place})) for place in ("roof", "floor")]
     _append(source, b"".join([*more[:100], build(chunk), *rig, b"\x80" + bytes(8)]))
     done = convert(source, tmp_path / "out.mcap")
     assert done.returncode == 3, done.stderr
     assert "not carried over: 1 of 0x80" in done.stderr
+    assert "records in chunks that are none of MCAP's own are not carried over: 1 of 0x90" in done.stderr
     assert "later values replace others: mount of rig" in done.stderr
     assert "100 messages lie outside chunks" in done.stderr
     assert read(tmp_path / "out.mcap").imu.t_ns.tolist() == [*T_NS.tolist(), *later]
@@ -122,6 +123,23 @@ def test_an_imu_that_never_sent_a_message_is_no_choice(tmp_path, options):
         writer.finish()
     assert read(tmp_path / "in.mcap").imu_topic == "/imu"
     assert len(read(tmp_path / "in.mcap", imu="/spare/imu").imu) == 0
+
+
+def test_topics_without_messages_are_kept_or_named(convert, tmp_path):
+    """They were dropped without a word; those that are not CDR may become another topic by their first message."""
+    with (tmp_path / "in.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data")
+        writer.register_channel("/never", "cdr", schema)
+        writer.register_channel("/sent", "cdr", writer.register_schema("std_msgs/msg/Float32", "ros2msg", b"float32 data"))
+        writer.register_channel("/silent", "json", writer.register_schema("Text", "jsonschema", b"{}"))
+        writer.add_message(writer.register_channel("/sent", "cdr", schema), 1, b"\0\1\0\0" + bytes(8), 1)
+        writer.finish()
+    done = convert(tmp_path / "in.mcap", tmp_path / "out.mcap")
+    assert "topics without messages are left out: /silent" in done.stderr
+    with Log(tmp_path / "out.mcap") as log:
+        assert {name: topic.count for name, topic in log.topics.items()} == {"/never": 0, "/sent": 1}
 
 
 def test_metadata_of_each_part_of_a_bag_are_kept(convert, tmp_path):

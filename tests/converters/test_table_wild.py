@@ -503,14 +503,23 @@ def test_readings_in_several_states_are_asked_unless_one_has_none(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("gyro", "accel", "sizes"), [("mrad/s", "mm/s^2", (1e-3, 1e-3)), ("deg/h", "µg", (np.pi / 180.0 / 3600.0, 9.80665e-6))]
+    ("gyro", "accel", "sizes"),
+    [
+        ("mrad/s", "mm/s^2", (1e-3, 1e-3)),
+        ("deg/h", "µg", (np.pi / 180.0 / 3600.0, 9.80665e-6)),
+        ("deg/min", "g", (np.pi / 180.0 / 60.0, 9.80665)),
+        ("rpm", "g", (np.pi / 30.0, 9.80665)),
+        ("rev/s", "g", (2.0 * np.pi, 9.80665)),
+    ],
 )
-def test_small_units_in_a_header_are_multiplied(tmp_path, gyro, accel, sizes):
+def test_other_units_in_a_header_are_multiplied(tmp_path, gyro, accel, sizes):
     names = ["time [s]", *(f"gyro_{a} [{gyro}]" for a in "xyz"), *(f"acc_{a} [{accel}]" for a in "xyz")]
     rates, forces = 0.01 * COUNTS, 9.80665 * ACCEL_G
-    imu = read(write_csv(tmp_path / "imu.csv", names, [T_S, *(rates / sizes[0]).T, *(forces / sizes[1]).T])).imus["/imu0"]
-    np.testing.assert_allclose(imu.gyro, rates, rtol=1e-9)
-    np.testing.assert_allclose(imu.accel, forces, rtol=1e-9)
+    columns = [T_S, *(rates / sizes[0]).T, *(forces / sizes[1]).T, 100.0 + T_S]
+    log = read(write_csv(tmp_path / "imu.csv", [*names, "motor [rpm]"], columns))
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, rates, rtol=1e-9)
+    np.testing.assert_allclose(log.imus["/imu0"].accel, forces, rtol=1e-9)
+    np.testing.assert_allclose(next(iter(log.scalars.values())).values[:, 0], 100.0 + T_S)
 
 
 def test_multiples_of_a_unit_in_a_header_are_applied_and_ranges_are_not(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 import numpy as np
@@ -217,3 +218,14 @@ def test_fields_whose_names_differ_by_capitals_have_names_that_ros_reads(convert
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         (message,) = [found for _, channel, _, found in reader.iter_decoded_messages(["/script"])]
     assert (message.roll, message.roll_2) == (1.0, 2.0)
+
+
+def test_a_damaged_start_of_the_log_costs_no_message(convert, tmp_path):
+    """A start beyond 64 bits of nanoseconds ended in a traceback, where a message has no stamp."""
+    writer = Ulog()
+    writer.topic("script", "uint64_t timestamp;float roll", [(0, 1.0), (START_US, 2.0)])
+    path = writer.write(tmp_path / "a.ulg")
+    path.write_bytes(path.read_bytes().replace(struct.pack("<Q", START_US), bytes(7) + b"\xff", 1))
+    assert convert(path, tmp_path / "a.mcap").returncode == 3  # no IMU
+    with Log(tmp_path / "a.mcap") as log:
+        assert log.topics["/script"].count == 2

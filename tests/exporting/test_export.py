@@ -19,6 +19,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from mcap.writer import Writer
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
@@ -295,6 +296,18 @@ def test_images_pass_through_one_at_a_time(tmp_path: Path) -> None:
     assert peak < 20 * IMAGE_BYTES  # of 60; a chunk holds several
 
 
+def test_a_camera_without_a_number_takes_no_other_s_folder(tmp_path: Path) -> None:
+    """A camera of another name was written as cam0, with the sensor.yaml of that, which was left out."""
+    frames = {f"/{name}/image_raw/compressed": images(count) for name, count in (("cam1", 2), ("front", 3), ("cam0", 4))}
+    write(Recording("made", whole().imu, frames=frames), tmp_path / "log.mcap")
+    report = export(tmp_path / "log.mcap", tmp_path / "out", format="euroc")
+    assert {name: report.written[f"cam{n}/data.csv"] for n, name in enumerate(("cam0", "cam1", "front"))} == {
+        "cam0": 4,
+        "cam1": 2,
+        "front": 3,
+    }
+
+
 # ── rosbag2 ──
 
 
@@ -345,6 +358,20 @@ def test_the_metadata_follows_version_5_with_numbers_for_qualities(log: Path, tm
         numbers = (quality["history"], quality["reliability"], quality["durability"], quality["liveliness"])
         assert numbers == (1, 1, 2, 1)  # keep last, reliable, volatile, automatic
         assert quality["deadline"] == {"sec": 9223372036, "nsec": 854775807}
+
+
+def test_an_imu_in_a_type_of_its_own_keeps_that_type(tmp_path: Path) -> None:
+    """The metadata said sensor_msgs/msg/Imu, and rosbags read no message."""
+    definition = "".join(f"float64 {sensor}_{axis}\n" for sensor in ("gyro", "accel") for axis in "xyz")
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        schema = writer.register_schema("my_driver/msg/Imu", "ros2msg", definition.encode())
+        writer.add_message(writer.register_channel("/imu", "cdr", schema), START_NS, b"\0\1\0\0" + bytes(48), START_NS)
+        writer.finish()
+    export(tmp_path / "log.mcap", tmp_path / "bag", format="rosbag2")
+    with Reader(tmp_path / "bag") as reader:
+        assert [connection.msgtype for connection, *_ in reader.messages()] == ["my_driver/msg/Imu"]
 
 
 def test_a_log_that_is_no_ros2_log_cannot_be_copied_into_a_bag(log: Path, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.records import MessageIndex
 from mcap.writer import Writer
 from support.imu_defects import survey
 
@@ -409,3 +410,17 @@ def test_units_in_the_comments_of_a_definition_are_named(tmp_path: Path) -> None
     assert [value for _, name, value in imu_rows(report) if name == "units"] == [said]
     assert json_values(report)["imu"][0]["stated_units"] == "gyro in deg/s, accel in g"
     np.testing.assert_allclose(read(tmp_path / "b.mcap").imu.gyro[0], [np.pi, 0.0, 0.0])
+
+
+def test_messages_that_a_message_index_leaves_out_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every second message was missed, and the rate was half of what it is."""
+    whole = MessageIndex.write
+    monkeypatch.setattr(MessageIndex, "write", lambda self, to: whole(MessageIndex(self.channel_id, self.records[::2]), to))
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        text = writer.register_channel("/text", "json", writer.register_schema("Text", "jsonschema", b"{}"))
+        for n in range(200):
+            writer.add_message(text, START_NS + n * PERIOD_NS, b'"text"', START_NS)
+        writer.finish()
+    assert described(tmp_path / "a.mcap")["messages"] == 200

@@ -14,7 +14,7 @@ from imutool.array_types import Bool, Float64, Int64, Shaped, UInt8
 from imutool.errors import ConfigError
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.codec.messages import Messages, Rows, columns
-from imutool.mcap_io.codec.schemas import VECTOR3
+from imutool.mcap_io.codec.schemas import ACCELS, VECTOR3
 
 SENSOR_WORDS = r"gyro(scope)?", r"accel(erometer)?"
 JOIN_VECTORS = "; imutool debias and others read a gyro's and an accelerometer's vectors as one: --imu gyro=TOPIC,accel=TOPIC"
@@ -92,7 +92,7 @@ def choice_of(topics: Iterable[str]) -> str:
 def no_imu_fix(topics: Iterable[tuple[str, str]]) -> str:
     """Hint for a log without an IMU, by the types and encodings of its topics; may be empty."""
     types, encodings = zip(*topics, strict=True) if (topics := list(topics)) else ((), ())
-    if types.count(VECTOR3) > 1:
+    if types.count(VECTOR3) > 1 or {*ACCELS} & {*types}:
         return "`imu` gyro=TOPIC,accel=TOPIC joins the vectors of a gyroscope (rad/s) and of an accelerometer (m/s²)"
     if {"px4_msgs/msg/SensorGyro", "px4_msgs/msg/VehicleImu"} & {*types}:
         return "imutool convert makes an IMU of PX4's topics"

@@ -165,19 +165,21 @@ _unpacker = _Unpacker()
 
 
 def _decompress(compression: str, packed: memoryview, size: int) -> bytes | memoryview:
-    """Decompresses, and never allocates more than `size`, whatever the packed bytes say."""
+    """Decompress one frame, or several in a row, and never allocate more than `size`, whatever the packed bytes say."""
     if compression == "zstd":
-        if size == 0:
-            if _unpacker.zstd.stream_reader(packed).read(1):
-                raise ValueError("the zstd frame holds something, the chunk nothing")
-            return b""
-        if (stated := zstandard.frame_content_size(packed)) not in (-1, size):
-            raise ValueError(f"the zstd frame says {stated} bytes, the chunk {size}")
-        data: bytes = _unpacker.zstd.decompress(packed, max_output_size=size)
+        if size and zstandard.frame_content_size(packed) in (-1, size):
+            data: bytes = _unpacker.zstd.decompress(packed, max_output_size=size)
+            if len(data) == size:
+                return data
+        data = _unpacker.zstd.stream_reader(packed, read_across_frames=True).read(size + 1)
+        if len(data) > size:
+            raise ValueError(f"the zstd frames go on beyond the chunk's {size} bytes")
         return data
     if compression == "lz4":
         context = lz4.frame.create_decompression_context()  # `LZ4FrameDecompressor` would copy the packed bytes first
         data, read, ended = lz4.frame.decompress_chunk(context, packed, max_length=size)
+        if ended and read < len(packed) and len(data) < size:
+            return bytes(lz4.frame.LZ4FrameFile(BytesIO(packed)).read(size + 1))
         if not ended and lz4.frame.decompress_chunk(context, packed[read:], max_length=1)[0]:
             raise ValueError(f"the lz4 frame goes on beyond the chunk's {size} bytes")
         return data

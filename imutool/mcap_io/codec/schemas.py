@@ -31,7 +31,9 @@ FLOAT = "std_msgs/msg/Float64"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 PRESSURE = "sensor_msgs/msg/FluidPressure"
-MESSAGE_TWISTS = {"geometry_msgs/msg/TwistStamped": "twist", TWIST: "twist.twist", ODOMETRY: "twist.twist"}  # the twist's field
+TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
+ACCELS = "geometry_msgs/msg/AccelStamped", "geometry_msgs/msg/AccelWithCovarianceStamped"
+MESSAGE_TWISTS = {TWIST_STAMPED: "twist", TWIST: "twist.twist", ODOMETRY: "twist.twist"}  # the twist's field
 
 NS_PER_S = 1_000_000_000
 Found = TypeVar("Found")  # what is known of a stretch of messages
@@ -111,11 +113,15 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     VECTOR3: ("header", 3),
     TWIST: ("header", 6 + 36),
     TF: ("count", "header", "text", 7),
+    TWIST_STAMPED: ("header", 6),
+    **dict(zip(ACCELS, (("header", 6), ("header", 6 + 36)), strict=True)),
     FLOAT: (1,),
     ODOMETRY: ("header", "text", 7 + 36 + 6 + 36),
     TRANSFORM: ("header", "text", 7),
     IMAGE: ("header", "text", "bytes"),
 }
+# Where a gyroscope's or an accelerometer's vector stands among the numbers of a message: angular behind linear.
+VECTORS = {VECTOR3: slice(0, 3), TWIST_STAMPED: slice(3, 6), TWIST: slice(3, 6), **dict.fromkeys(ACCELS, slice(0, 3))}
 # Where the fields stand among the numbers of an Imu, and those of a pose.
 ORIENTATION, ORIENTATION_COVARIANCE = slice(0, 4), slice(4, 13)
 GYRO, GYRO_COVARIANCE = slice(13, 16), slice(16, 25)

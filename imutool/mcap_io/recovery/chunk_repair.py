@@ -146,13 +146,15 @@ def _candidates(raw: bytes, known: ChunkIndex | None) -> Iterator[bytes]:
 def keeps_sound(head: records.ChunkHead, raw: bytes, found: messages.Messages) -> bool:
     """Whether a chunk that is copied as it is can be told to be sound.
 
-    Its head must agree with its messages: the summary of the copy does. A frame of lz4 must end where its data do, since
-    other readers refuse it otherwise.
+    Its head must agree with its messages: the summary of the copy does. Its data must be one frame that ends where they do,
+    since other readers refuse several, or one without an end.
     """
     if len(found.heads) and (head.start_ns, head.end_ns) != messages.span(found.times()):
         return False
     packed = raw[head.data_at :]
-    if head.compression != "lz4":
+    if head.compression == "zstd":
+        return zstandard.frame_content_size(packed) == head.size or _is_one_frame(packed)
+    if head.compression == "":
         return True
     frame = lz4.frame.LZ4FrameDecompressor()
     try:

@@ -32,7 +32,7 @@ from imutool.viewing.stream.stream_fit import STREAM, SWITCH_S, StreamFit, check
 
 START_S = 2.0  # of the stream, from which the initial bias is taken
 BATCH_S = 0.1  # shown together
-MAX_WAITING = 256  # batches: a viewer that does not keep up loses some rather than fill the memory
+MAX_WAITING = 2048  # batches, 3 minutes of a stream and some 100 MB at 1 kHz: of more that nobody draws, some are lost
 MOST_FIRST = 1 << 16  # samples before the start, where the clock jumps again and again
 MAX_DELAYS = 1 << 20  # of which percentiles are taken: 17 minutes at 1 kHz, then a random choice
 

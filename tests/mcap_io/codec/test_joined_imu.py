@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_typestore
 
 from imutool import info
 from imutool.conversion.run import convert
@@ -112,3 +114,31 @@ def test_what_is_no_such_pair_is_refused(tmp_path):
 )
 def test_topics_that_differ_by_the_sensor_alone_are_a_pair(topics: list[str], pairs: dict[str, tuple[str, str]]) -> None:
     assert pairs_by_name(topics) == pairs
+
+
+@pytest.mark.parametrize("accel", schemas.ACCELS)
+def test_a_twist_and_an_acceleration_are_joined(tmp_path, accel):
+    """Drivers of ROS have rates in TwistStamped and accelerations in AccelStamped."""
+    store, stamps = get_typestore(Stores.ROS2_HUMBLE), GYRO_NS[:200:2].tolist()
+    vector, header = store.types["geometry_msgs/msg/Vector3"], store.types["std_msgs/msg/Header"]
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        for topic, kind, parts in (
+            ("/rate", schemas.TWIST_STAMPED, ("Twist",)),
+            ("/force", accel, ("Accel", "AccelWithCovariance")[: 1 + ("With" in accel)]),
+        ):
+            channel = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", b""))
+            for n, t_ns in enumerate(stamps):
+                stamp = store.types["builtin_interfaces/msg/Time"](t_ns // 10**9, t_ns % 10**9)
+                content = store.types[f"geometry_msgs/msg/{parts[0]}"](vector(*ACCEL[n]), vector(*GYRO[n]))
+                if len(parts) > 1:
+                    content = store.types[f"geometry_msgs/msg/{parts[1]}"](content, np.zeros(36))
+                message = store.types[kind](header(stamp, "imu"), content)
+                writer.add_message(channel, t_ns, bytes(store.serialize_cdr(message, kind)), t_ns)
+        writer.finish()
+    with pytest.raises(LogError, match="gyro=TOPIC,accel=TOPIC joins the vectors"):
+        read(tmp_path / "log.mcap")
+    imu = read(tmp_path / "log.mcap", imu="gyro=/rate,accel=/force").imu
+    np.testing.assert_array_equal(imu.gyro, GYRO[:100])
+    np.testing.assert_allclose(imu.accel, ACCEL[:100], rtol=1e-12)
