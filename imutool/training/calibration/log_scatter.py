@@ -113,7 +113,7 @@ def shared_by_scatter(
 
 
 class LogPieces(NamedTuple):
-    """Pieces of logs, each with a rest bias of its own: that of each sample, and the log of each."""
+    """Piece of each sample, with a rest bias of its own, and the log of each piece."""
 
     of_sample: Int[Tensor, " n"]
     log: Int[Tensor, " pieces"]
