@@ -175,7 +175,7 @@ def _turns_against_poses(
     """Readings of the gyro against the poses, the poses, and what is wrong with their quaternions; the least turn first.
 
     Misread ones leave no gyro, or no sure axes that are those of the log, and otherwise fit it clearly better, turned at most.
-    So do they where the body is turned by any angle, as no order of axes fits 40°. Several fit alike, up to a turn of the world.
+    So do they with a body turned by any angle, as no order of axes fits 40°. Several fit alike, up to a turn of the world.
     """
     gyro = _gyro_against_poses(step, mean, start_ns, truth)
     if gyro is not None and gyro.sole and gyro.as_is:
