@@ -28,7 +28,7 @@ def read_right(what: str, q_wxyz: Float64[np.ndarray, "n 4"]) -> Float64[np.ndar
 
 
 def left_when_turned(gyro: Float64[np.ndarray, "n 3"], rate: Float64[np.ndarray, "n 3"]) -> float:
-    """Median rate (rad/s) between gyro and poses whose body is turned by the angle that fits best."""
+    """Median rate (rad/s) between gyro and poses, their body turned as fits best."""
     return float(median(np.linalg.norm(gyro - rate @ best_rotation(gyro, rate).T, axis=1)))
 
 
