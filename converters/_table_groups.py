@@ -223,8 +223,8 @@ def time_beside(columns: Columns, column: str, time: str, unit: str, *, apart: b
     while group and not found:
         long = {c: values for c, values in columns.values.items() if group_of(c) == group and len(values) == length}
         rising = [c for c, values in long.items() if goes_on(values)]
-        ending = (c for c in rising if re.fullmatch(rf"(.*_)?{TIME_WORDS}", spaced_name(leaf_of(c))))  # imuTimestamp
-        found = list(filter(is_time, rising)) or list(ending)
+        longer = rf"(.*_)?{TIME_WORDS}|time_?stamp_.*"  # imuTimestamp, timestamp_global
+        found = list(filter(is_time, rising)) or [c for c in rising if re.fullmatch(longer, spaced_name(leaf_of(c)))]
         group = group_of(group)
     if not found or time in found:
         return None

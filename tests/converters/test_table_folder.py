@@ -383,10 +383,12 @@ def test_tables_with_a_clock_of_a_name_of_their_own_keep_it(tmp_path):
         (tmp_path / f"{name}.csv").write_text(named.format(title, unit) + "\n".join(lines) + "\n")
     lines = (f"{a},{b},{a},{a},{a}" for a, b in zip(boot_ms[::3], utc_ns[::3], strict=True))
     (tmp_path / "magnetic_field.csv").write_text(named.format("mfield", "uT") + "\n".join(lines) + "\n")
+    (tmp_path / "air.csv").write_text("timestamp_global[ns],pressure[mbar]\n" + "".join(f"{t},{t % 7}\n" for t in utc_ns[::5]))
     (sequence,) = table.sequences(tmp_path)
     log = table.read_sequence(sequence)
-    (field,) = (scalars for topic, scalars in log.scalars.items() if "mfield_x" in topic)
-    assert np.array_equal(field.t_ns, utc_ns[::3])
+    for name, step in (("mfield_x", 3), ("pressure", 5)):
+        (found,) = (scalars for topic, scalars in log.scalars.items() if name in topic)
+        assert np.array_equal(found.t_ns, utc_ns[::step])
     assert log.remarks.losses == []
 
 
