@@ -219,13 +219,17 @@ def time_beside(columns: Columns, column: str, time: str, unit: str, *, apart: b
     length = len(columns.values[column])
     if "/" not in column and not columns.has_structures and length == len(columns.values[time]):
         return None
-    group, other = group_of(column), ""
-    while group and not other:
+    group, found = group_of(column), list[str]()
+    while group and not found:
         long = {c: values for c, values in columns.values.items() if group_of(c) == group and len(values) == length}
-        found = [c for c, values in long.items() if is_time(c) and goes_on(values)]
-        other = time if time in found else next(iter(found), "")
+        rising = [c for c, values in long.items() if goes_on(values)]
+        longer = rf"(.*_)?{TIME_WORDS}|time_?stamp_.*"  # imuTimestamp, timestamp_global
+        found = list(filter(is_time, rising)) or [c for c in rising if re.fullmatch(longer, spaced_name(leaf_of(c)))]
         group = group_of(group)
-    return _with_unit(columns, other, time, unit, apart=apart) if other not in ("", time) else None
+    if not found or time in found:
+        return None
+    together = (_with_unit(columns, each, time, unit, apart=False) for each in found)
+    return next(filter(None, together), None) or _with_unit(columns, found[0], time, unit, apart=apart)
 
 
 def _with_unit(columns: Columns, other: str, time: str, unit: str, *, apart: bool) -> tuple[str, str] | None:

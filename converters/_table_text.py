@@ -145,10 +145,15 @@ def is_text_table(head: bytes, least: int = LEAST_NUMBERS) -> bool:
 
 
 def _delimiter(rows: list[str], least: int = LEAST_NUMBERS) -> str | None:
-    """What separates most rows into equally many fields of which `least` are numbers; None for white space."""
+    """What separates most rows into equally many fields of which `least` are numbers; None for white space.
+
+    Where each row may be one number with a decimal comma, a header of as many names shows two.
+    """
     looked, marks = rows[:LOOKED_AT], (";", "\t", ",", None)
     widths = {mark: Counter(len(row.split(mark)) for row in looked if _is_row(row, mark, least)) for mark in marks}
-    return max(marks, key=lambda mark: max(widths[mark].values(), default=0))  # of equals the first
+    best = max(marks, key=lambda mark: max(widths[mark].values(), default=0))  # of equals the first
+    headers = {len(row.split(",")) for row in looked if not _is_row(row, ",", least)}
+    return "," if [*widths[best]] == [1] and [*widths[","]] == [2] and 2 in headers else best
 
 
 def _is_row(line: str, delimiter: str | None, least: int) -> bool:

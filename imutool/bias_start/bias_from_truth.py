@@ -37,7 +37,7 @@ NOT_SEEN = 1e3  # m/s²: deviation of the accelerometer's bias from poses withou
 WORLD_TILT_STD = np.array([0.0] * 3 + [0.1] * 3)  # m/s²: half a degree, as of EuRoC's second Vicon room
 STEP_S = 0.1  # over which turns of poses and gyro are compared
 JUMP_RAD, JUMP_MEDIANS, JUMP_SHARE = np.deg2rad(5.0), 10.0, 0.2  # as `imutool info` counts jumps of poses
-BRIDGED_S = 0.5  # longest gap of the poses over which turns are compared
+BRIDGED_S = 2.0  # longest gap of the poses over which turns are compared: of a wrong pose between gaps both jumps count
 LOST = 2.5  # median periods, beyond which samples are lost
 MOUNT_STD = 0.05  # rad: plausible rotation of markers that were meant to be straight
 SAME = 100.0  # samples whose poses have the same error
@@ -133,13 +133,17 @@ def poses_turn_alone(imu: Imu, truth: Poses) -> Bool[np.ndarray, " n"]:
     begin, end = first[step[:-1]], first[step[1:]]
     known = (np.diff(step) == 1) | (t[end] - t[begin] < BRIDGED_S)
     if known.any():
-        turned = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.gyro[:-1] * dt[:, None], axis=0)])
-        seen, span, q = turned[end] - turned[begin], (t[end] - t[begin])[:, None], poses.q_wb_wxyz
-        more = seen - quaternion.log(quaternion.multiply(quaternion.inverse(q[begin]), q[end]))
+        steps = quaternion.running_product(quaternion.exp(imu.gyro[:-1] * dt[:, None]))
+        by_gyro = quaternion.unit(np.concatenate([[[1.0, 0.0, 0.0, 0.0]], steps]))
+        seen, true = (quaternion.multiply(quaternion.inverse(q[begin]), q[end]) for q in (by_gyro, poses.q_wb_wxyz))
+        more, span = quaternion.log(quaternion.multiply(seen, quaternion.inverse(true))), (t[end] - t[begin])[:, None]
         off = np.where(known[:, None], more - np.median((more / span)[known], axis=0) * span, 0.0)
+        off = quaternion.rotate(by_gyro[begin], off)  # in one frame, that of the first sample: the body turns over a gap
         padded = np.pad(off, ((1, 1), (0, 0)))
         misfit, lasting = (np.linalg.norm(x, axis=1) for x in (off, padded[:-2] + off + padded[2:]))
-        most = np.maximum(JUMP_SHARE * np.linalg.norm(seen, axis=1), max(JUMP_RAD, JUMP_MEDIANS * median(misfit[known])))
+        most = np.maximum(
+            JUMP_SHARE * np.linalg.norm(quaternion.log(seen), axis=1), max(JUMP_RAD, JUMP_MEDIANS * median(misfit[known]))
+        )
         clipped = np.logical_or.reduce([at_limit(column) for column in imu.gyro.T])[:-1]
         lost = np.logical_or.reduceat(clipped | (dt > LOST * median(dt)), begin)
         out[begin[0] : end[-1]] = np.repeat(known & (lost | ((misfit > most) & (lasting > most))), end - begin)

@@ -17,7 +17,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.cleaning.likelihood import BLOCKS_S, CLEARLY, FEWEST_BLOCKS, SURE, Choice, Reading, choose, signed_permutations
 from imutool.cleaning.pose_delay import Delay, StepIntegral, pose_delay, usable
-from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, is_other_world, read_right
+from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, is_other_world, left_when_turned, read_right
 from imutool.cleaning.position_unit import POSITIONS, Misfits, position_unit
 from imutool.cleaning.samples import STEP_S, Motion
 from imutool.cleaning.truth import Truth, axis_of_gravity, best_rotation, force_in_world, rotation_deg, turning
@@ -175,7 +175,7 @@ def _turns_against_poses(
     """Readings of the gyro against the poses, the poses, and what is wrong with their quaternions; the least turn first.
 
     Misread ones leave no gyro, or no sure axes that are those of the log, and otherwise fit it clearly better, turned at most.
-    Several fit alike, up to a turn of the world.
+    So do they with a body turned by any angle, as no order of axes fits 40°. Several fit alike, up to a turn of the world.
     """
     gyro = _gyro_against_poses(step, mean, start_ns, truth)
     if gyro is not None and gyro.sole and gyro.as_is:
@@ -185,7 +185,9 @@ def _turns_against_poses(
         other = truth._replace(q_wb_wxyz=read_right(what, truth.q_wb_wxyz))
         found = _gyro_against_poses(step, mean, start_ns, other)
         if found is not None and found.sole and (gyro is None or found.misfit < CLEARLY * gyro.misfit):
-            fitting.append((found, other, what))
+            rates = (_rates(step, mean, start_ns, each)[:2] for each in (other, truth))
+            left = [left_when_turned(RATES[found.unit] * measured, true) for true, measured in rates]
+            fitting += [(found, other, what)] * (left[0] < CLEARLY * left[1])
     fitting.sort(key=lambda each: -float(np.trace(each[0].axes)))
     return [each for each in fitting if np.linalg.det(each[0].axes) > 0.0] or [(gyro, truth, "")]
 
@@ -194,13 +196,9 @@ def _gyro_against_poses(
     step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m 6"], start_ns: int, truth: Truth
 ) -> Reading | None:
     """Reading of the gyro under which it is the rate of the poses."""
-    first, last, rate = turning(truth)
-    use, first_s, last_s = usable(first, last, start_ns, step)
-    if not len(use):
+    true, measured, first_s, last_s = _rates(step, mean, start_ns, truth)
+    if not len(true):
         return None
-    true = rate[use] - median(rate[use])
-    measured = StepIntegral.of(step, mean[:, :3]).between(first_s, last_s)
-    measured -= median(measured)
     readings = _rate_readings(float(quantile(np.linalg.norm(measured, axis=1), 0.9)))
     if not readings:
         return None
@@ -218,6 +216,18 @@ def _gyro_against_poses(
     turned = rotation_deg(best_rotation(gyro, true), gyro, true, float(last_s[-1] - first_s[0]))
     small = turned is not None and np.linalg.norm(turned.deg) + 3.0 * turned.std_deg.max() < STRAIGHT_DEG
     return nearest._replace(straight=bool(small))
+
+
+def _rates(
+    step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m 6"], start_ns: int, truth: Truth
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """Rates of the poses and of the gyro over the same times, each without its median, and the ends of these (s)."""
+    first, last, rate = turning(truth)
+    use, first_s, last_s = usable(first, last, start_ns, step)
+    if not len(use):
+        return rate[:0], rate[:0], first_s, last_s
+    measured = StepIntegral.of(step, mean[:, :3]).between(first_s, last_s)
+    return rate[use] - median(rate[use]), measured - median(measured), first_s, last_s
 
 
 def _nearest(choice: Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:

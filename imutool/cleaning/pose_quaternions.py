@@ -6,8 +6,10 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.cleaning.likelihood import CLEARLY, SURE, choose
+from imutool.cleaning.truth import best_rotation
 from imutool.geometry import quaternion
 from imutool.recording import GRAVITY_M_S2
+from imutool.recording.columns import median
 
 MISREAD = {  # quaternions of poses: what is wrong with them, and the rows and signs that make w, x, y, z of them
     "have their w in the place of z": ((3, 0, 1, 2), (1, 1, 1, 1)),
@@ -23,6 +25,11 @@ def read_right(what: str, q_wxyz: Float64[np.ndarray, "n 4"]) -> Float64[np.ndar
         return np.asarray(quaternion.multiply(quaternion.NED_FROM_ENU, q_wxyz))
     rows, signs = MISREAD[what]
     return np.asarray(q_wxyz[:, rows] * signs)
+
+
+def left_when_turned(gyro: Float64[np.ndarray, "n 3"], rate: Float64[np.ndarray, "n 3"]) -> float:
+    """Median rate (rad/s) between gyro and poses, their body turned as fits best."""
+    return float(median(np.linalg.norm(gyro - rate @ best_rotation(gyro, rate).T, axis=1)))
 
 
 def is_other_world(

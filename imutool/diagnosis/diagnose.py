@@ -23,7 +23,7 @@ from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
-from imutool.diagnosis.estimation.noise_estimate import whitened
+from imutool.diagnosis.estimation.noise_estimate import whitened_stretches
 from imutool.diagnosis.estimation.observability import for_noise, unobservable, with_free
 from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.trial.effect_forms import in_forms
@@ -141,7 +141,7 @@ def _beside_reference(
     pairs, conventions = with_common_conventions(pairs, "poses" if simulated is None else "simulation")
     report(1, 4, "noise")
     candidates = candidates_for(pairs)
-    logs = [whitened(pair, (*for_noise(candidates), *unnamed.driven([pair])), settings.band) for pair in pairs]
+    logs = whitened_stretches(pairs, lambda pair: (*for_noise(candidates), *unnamed.driven([pair])), settings.band)
     pairs = [log.pair for log in logs]
     report(2, 4, "searching")
     wrong, places = reference_errors(logs, settings.reference)
@@ -285,7 +285,7 @@ def effect_sizes(
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     of_poses = {clock_wander.EFFECT.name, SMOOTHED.name} - set(effects)
     candidates = [effect for effect in candidates_for(pairs) if effect.name not in of_poses]
-    logs = [whitened(pair, for_noise(candidates), settings.band) for pair in pairs]
+    logs = whitened_stretches(pairs, lambda _: for_noise(candidates), settings.band)
     named = catalogue.diagnosed([name for name in effects if name != SMOOTHED.name])
     last_s = max(float(pair.stamp_s[-1]) for pair in pairs)
     wanted = [*clock_wander.with_knots(named, last_s), *((SMOOTHED,) if SMOOTHED.name in effects else ())]

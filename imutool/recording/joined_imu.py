@@ -240,7 +240,7 @@ def joined(
         f"the accelerometer interpolated; {_delay_sentence(rates, forces)}"
     )
     if not inside.all():
-        notes.append(f"{name}: {int((~inside).sum())} gyro samples have no accelerometer sample near them")
+        notes.append(f"{name}: gyro samples without an accelerometer sample near them: {int((~inside).sum())}")
     alone = (forces.t_ns < rates.t_ns[0]) | (forces.t_ns > rates.t_ns[-1])
     if (alone_s := alone.sum() / rate_hz[1]) > LONGEST_ALONE_S:
         said = f"{int(alone.sum())} accelerometer samples ({alone_s:.1f} s) before or after all of the gyro's are left out"

@@ -255,6 +255,18 @@ def test_poses_that_jump_and_are_back_at_once_are_no_bias(biased: Recording) -> 
     np.testing.assert_allclose(start.rest[:3], right.rest[:3], atol=3e-4)
 
 
+def test_poses_that_are_wrong_and_then_hidden_for_a_second_are_no_bias(biased: Recording) -> None:
+    """Only the jump to the wrong pose was left out and not that back: a phone had 125° where its raw samples had 2°."""
+    t = seconds(biased.truth.t_ns, int(biased.imu.t_ns[0]))
+    away = np.radians(40.0) * ((t > 7.9) & (t < 8.1))[:, None] * [0.6, 0.0, 0.8]
+    turned = Rotation.from_quat(biased.truth.q_wb_wxyz, scalar_first=True) * Rotation.from_rotvec(away)
+    jumped = replace(biased.truth, q_wb_wxyz=turned.as_quat(scalar_first=True)).rows((t < 8.1) | (t > 9.3))
+    right, start = (
+        from_truth(sees_everything(), replace(biased, truths={"/truth": truth})) for truth in (biased.truth, jumped)
+    )
+    np.testing.assert_allclose(start.rest[:3], right.rest[:3], atol=1e-3)
+
+
 def test_poses_whose_parts_disagree_are_trusted_less(biased: Recording) -> None:
     """The world of the poses leans to and fro by six degrees, slowly."""
     t = seconds(biased.truth.t_ns, int(biased.imu.t_ns[0]))

@@ -12,7 +12,7 @@ from support.imu_defects import batch_of
 
 from imutool.cleaning.conventions import Conventions, judge
 from imutool.cleaning.likelihood import signed_permutations
-from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, read_right
+from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, left_when_turned, read_right
 from imutool.cleaning.position_unit import POSITIONS, Misfits
 from imutool.cleaning.rule import CleaningSettings, TopicSummary
 from imutool.cleaning.rules.axes import LATE_S, TO_Z_UP, Axes
@@ -149,6 +149,17 @@ def test_without_positions_gravity_shows_the_right_one_of_readings_that_are_alik
     read = truth._replace(q_wb_wxyz=misread(truth.q_wb_wxyz, what), p_wb=np.zeros_like(truth.p_wb))
     found = judge(motion_of(on_its_back), read, 1.0)
     assert found.quaternions == what
+
+
+@pytest.mark.parametrize("what", MISREAD)
+def test_a_body_that_is_turned_by_any_angle_leaves_little_and_a_misread_quaternion_much(what: str) -> None:
+    """A phone's markers were turned so that no order of axes fits: --fix changed the order of stated quaternions."""
+    omega = waves(20.0, (0.1, 0.2, 0.37))
+    rate = Rotation.from_rotvec([-54.2, -105.1, 86.5], degrees=True).inv().apply(omega)
+    q = Rotation.from_quat(misread(turned(rate)[1].q_wb_wxyz, what), scalar_first=True)
+    wrong = RATE_HZ * (q[:-1].inv() * q[1:]).as_rotvec()
+    assert left_when_turned(omega, rate) < 1e-9
+    assert left_when_turned(omega[:-1], wrong) > 0.2
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8])

@@ -374,6 +374,24 @@ def test_of_several_accelerometers_the_one_with_no_further_word_is_asked_about(t
     np.testing.assert_allclose(table.read_sequence(sequence).imus["/imu0"].accel, ACCEL, rtol=1e-9)
 
 
+def test_tables_with_a_clock_of_a_name_of_their_own_keep_it(tmp_path):
+    """Columns beside `imuTimestamp` and `utcTimestamp(nanos)` of another length were left out, as if they had no time."""
+    named = "imuTimestamp,utcTimestamp(nanos)," + "{0}_x[{1}],{0}_y[{1}],{0}_z[{1}]\n"
+    utc_ns, boot_ms = np.round(1e9 * T_S).astype(np.int64), np.arange(COUNT) * 10
+    for name, title, unit, values in (("accelerometer", "acc", "m/s^2", ACCEL), ("gyroscope", "ang_vel", "rad/s", GYRO)):
+        lines = (f"{a},{b},{','.join(map(repr, row))}" for a, b, row in zip(boot_ms, utc_ns, values.tolist(), strict=True))
+        (tmp_path / f"{name}.csv").write_text(named.format(title, unit) + "\n".join(lines) + "\n")
+    lines = (f"{a},{b},{a},{a},{a}" for a, b in zip(boot_ms[::3], utc_ns[::3], strict=True))
+    (tmp_path / "magnetic_field.csv").write_text(named.format("mfield", "uT") + "\n".join(lines) + "\n")
+    (tmp_path / "air.csv").write_text("timestamp_global[ns],pressure[mbar]\n" + "".join(f"{t},{t % 7}\n" for t in utc_ns[::5]))
+    (sequence,) = table.sequences(tmp_path)
+    log = table.read_sequence(sequence)
+    for name, step in (("mfield_x", 3), ("pressure", 5)):
+        (found,) = (scalars for topic, scalars in log.scalars.items() if name in topic)
+        assert np.array_equal(found.t_ns, utc_ns[::step])
+    assert log.remarks.losses == []
+
+
 def test_what_one_file_shows_it_shows_in_a_folder(tmp_path):
     lines = zip(T_S.tolist(), GYRO.tolist(), (ACCEL / 9.80665).tolist(), strict=True)
     named = "".join(

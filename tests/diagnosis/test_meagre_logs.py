@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.diagnosis.wording.conclusion import conclusion
 from imutool.errors import DataError, LogError
+from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Poses
 from imutool.report import json_values
@@ -221,6 +223,15 @@ def test_poses_of_a_part_answer_for_that_part(tmp_path: Path) -> None:
     assert 3.0 <= trace.t_s[0] < 4.0
     assert 14.0 < trace.t_s[-1] <= 15.0
     assert any("poses cover 12 of 24 s" in one for one in d.remarks)
+
+
+def test_a_stretch_of_poses_that_the_samples_hardly_share_is_left_out(tmp_path: Path) -> None:
+    """A motion capture began before a phone, and lost it soon after: 3.3 of 106 s were said to be shared."""
+    logs = moving(tmp_path, {"lever_arm": ARM}, poses_s=np.concatenate([planted.clock(9.0), planted.clock(first_s=9.4)]))
+    real = read(logs.real)
+    late = real.imu.rows(real.imu.t_ns > real.imu.t_ns[0] + 6 * 10**9)
+    write(replace(real, imu=late), tmp_path / "late.mcap")
+    assert effects(diagnose([tmp_path / "late.mcap"])) == ["lever_arm"]
 
 
 def test_of_several_logs_one_without_usable_poses_is_left_out_with_a_word(tmp_path: Path) -> None:

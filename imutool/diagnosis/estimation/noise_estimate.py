@@ -7,7 +7,8 @@ fit of them would start. An effect left out here would be taken for noise, and n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -24,6 +25,8 @@ from imutool.errors import DataError
 from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.effects import vibration
+
+logger = logging.getLogger(__name__)
 
 RIDGE = 1e-8
 LEAST_ROWS = 2  # times the order of the noise model: rows that follow others without a gap
@@ -47,6 +50,27 @@ def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -
     _check_rows(pair, band)
     whiten = _in_band(pair, _rich(pair, candidates, band), pair.real - ideal, band)
     return _counting(pair, limited_to_quiet_axes(whiten, settings.noisy_axis))
+
+
+def whitened_stretches(
+    pairs: Sequence[Pair], candidates: Callable[[Pair], Sequence[Effect]], settings: BandSettings
+) -> list[WhitenedImu]:
+    """Whitened stretches of logs; a short one beside longer ones is left out with a warning.
+
+    Raises:
+        DataError: all are too short for a noise model.
+    """
+    logs, refused = list[WhitenedImu](), list[str]()
+    for number, pair in enumerate(pairs):
+        try:
+            logs.append(whitened(pair, candidates(pair), settings))
+        except DataError as error:
+            if not logs and number + 1 == len(pairs):
+                raise
+            refused.append(f"{pair.stamp_s[0]:.1f} to {pair.stamp_s[-1]:.1f} s are left out: {error}")
+    for reason in refused:
+        logger.warning("%s", reason)
+    return logs
 
 
 def _check_rows(pair: Pair, band: Band) -> None:

@@ -31,19 +31,22 @@ def even(
     """Stamps of an even clock fitted to the stamps, and the number of missing samples.
 
     The period is the one in which the stamps agree best: missing samples do not change it. A running median of what each stamp
-    counts, less its number, says which are missing though every stamp jitters.
+    counts, less its number, says which are missing though every stamp jitters. In steady stamps long steps say it: a phone that
+    follows the network's time runs its clock faster or slower for seconds.
     """
-    k = np.arange(len(stamp_s), dtype=np.float64)
-    since = stamp_s - stamp_s[0]
-    period, phase, agree = _period(since, settings)
-    if agree < settings.least_agreement:
-        return _by_level(stamp_s, k, settings)
-    counted = np.rint((since - phase) / period) - k
-    steady = median_filter(counted, settings.median_samples, mode="nearest")
-    # a stamp well within its own period is taken at its word
-    clear = np.abs((since - phase) / period - k - counted) < settings.clear_share
-    missing = np.where(clear, counted, steady)
-    missing = np.where(np.abs(missing - steady) > 0.5, steady, missing) if not clear.all() else counted
+    k, since, steps = np.arange(len(stamp_s), dtype=np.float64), stamp_s - stamp_s[0], np.diff(stamp_s)
+    periods = np.maximum(np.rint(steps / np.median(steps)), 1.0)
+    missing = np.concatenate([[0.0], np.cumsum(periods - 1.0)])
+    if (np.abs(steps / np.median(steps) - periods) > settings.clear_share).any():
+        period, phase, agree = _period(since, settings)
+        if agree < settings.least_agreement:
+            return _by_level(stamp_s, k, settings)
+        counted = np.rint((since - phase) / period) - k
+        steady = median_filter(counted, settings.median_samples, mode="nearest")
+        # a stamp well within its own period is taken at its word
+        clear = np.abs((since - phase) / period - k - counted) < settings.clear_share
+        missing = np.where(clear, counted, steady)
+        missing = np.where(np.abs(missing - steady) > 0.5, steady, missing) if not clear.all() else counted
     slope, start = np.polyfit(k + missing, stamp_s, 1)
     return start + slope * (k + missing), int(missing[-1] - missing[0])
 
@@ -103,11 +106,8 @@ def dropped(pairs: Sequence[Pair]) -> list[Finding]:
         length += float(pair.stamp_s[-1] - pair.stamp_s[0])
     if missing < settings.least_missing:
         return []
-    share = missing / (missing + total)
-    parameters = {
-        "share": Estimate(share, float(np.sqrt(missing)) / (missing + total), "-"),
-        "missing": Estimate(float(missing), 0.0, "samples"),
-    }
+    share = Estimate(missing / (missing + total), float(np.sqrt(missing)) / (missing + total), "-")
+    parameters = {"share": share, "missing": Estimate(float(missing), 0.0, "samples")}
     held_out = HeldOut(0.0, 0.0, "-", round(length, 1))
     return [Finding("dropped_samples", "both", 0.0, 0.0, 0.0, parameters, "samples are missing", held_out)]
 

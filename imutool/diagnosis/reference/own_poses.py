@@ -88,12 +88,12 @@ def is_in_raw_poses(pair: Pair, line: Float64[np.ndarray, "n 6"], f_hz: float) -
 def _pairs(real: Recording, motion: SmoothMotion, settings: DiagnoseSettings) -> Iterator[Pair]:
     least_s, started_ns = settings.alignment.least_s, int(real.imu.t_ns[0])
     for ideal in motion.ideal_motions(1.0 / real.imu.period_s):
-        if ideal.t_s[-1] - ideal.t_s[0] < least_s:
+        # times are told from the log's start, also where its poses begin earlier or later
+        since = replace(ideal, t_s=ideal.t_s + (motion.start_ns - started_ns) * 1e-9)
+        if min(since.t_s[-1], real.imu.duration_s) - max(since.t_s[0], 0.0) < least_s:
             continue
         middle_s = (ideal.t_s[0] + ideal.t_s[-1]) / 2.0
         stretch = next(part for part in motion.stretches if part.start_s <= middle_s <= part.end_s)
-        # times are told from the log's start, also where its poses begin later
-        since = replace(ideal, t_s=ideal.t_s + (motion.start_ns - started_ns) * 1e-9)
         since = _with_lost_motion(since, stretch.cutoff_hz, settings.reference.band_share)
         pair = with_truth(real, since, started_ns, band_hz(stretch, settings.reference), settings)
         of_gyro = np.tile(np.arange(6) < 3, (len(pair.stamp_s), 1))  # without positions nothing is known of the accelerometer

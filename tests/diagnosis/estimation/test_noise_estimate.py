@@ -13,7 +13,7 @@ from support import planted
 
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.model_selection import select_effects
-from imutool.diagnosis.estimation.noise_estimate import known_band_hz, noise_std, whitened
+from imutool.diagnosis.estimation.noise_estimate import known_band_hz, noise_std, whitened, whitened_stretches
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.reference.errors import SMOOTHED
 from imutool.diagnosis.settings import BandSettings
@@ -53,6 +53,17 @@ def test_a_log_with_too_few_values_without_a_gap_is_refused() -> None:
     gaps = np.arange(len(pair.real)) * pair.period_s % 0.4 < 0.2
     with pytest.raises(DataError, match=r"0 values every 0\.\d+ s are there without a gap; expected 12 or more"):
         whitened(replace(pair, known=np.repeat(~gaps[:, None], 6, axis=1)), WITHOUT, BAND)
+
+
+def test_a_stretch_with_too_few_rows_is_left_out_beside_a_longer_one(caplog: pytest.LogCaptureFixture) -> None:
+    pair = beside_poses()
+    gaps = np.arange(len(pair.real)) * pair.period_s % 0.4 < 0.2
+    poor = replace(pair, known=np.repeat(~gaps[:, None], 6, axis=1))
+    (log,) = whitened_stretches([poor, pair], lambda _: WITHOUT, BAND)
+    assert log.pair.known is None
+    assert "are left out: " in caplog.text
+    with pytest.raises(DataError, match="0 values every"):
+        whitened_stretches([poor], lambda _: WITHOUT, BAND)
 
 
 @pytest.mark.parametrize(

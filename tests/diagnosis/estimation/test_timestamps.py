@@ -48,6 +48,14 @@ def test_a_clock_that_runs_fast_misses_nothing(ppm: float) -> None:
     assert np.abs(even - t).max() < 2 * NANOSECOND
 
 
+@pytest.mark.parametrize("gone", [[], [777], [777, 778, 1500]])
+def test_a_clock_that_is_slowed_for_seconds_misses_no_more(gone: list[int]) -> None:
+    """Steps of a phone were 2 % longer for seconds, none was twice as long: 28 samples were said to be missing."""
+    steps = np.diff(clean()) * np.where(np.arange(N - 1) % 1000 < 300, 1.02, 1.0)
+    slowed = np.concatenate([[0.0], np.cumsum(steps)])
+    assert timestamps.even(np.delete(slowed, gone))[1] == len(gone)
+
+
 @pytest.mark.parametrize(
     ("count", "jitter_s"),
     [(n, jitter_s) for n in (1, 5, 17) for jitter_s in (0.0, 1e-4)]

@@ -66,7 +66,7 @@ def test_two_topics_are_read_as_one_imu_on_the_gyros_stamps(tmp_path, schema, ca
     np.testing.assert_allclose(imu.accel, np.stack(wanted, axis=1), rtol=1e-12)
     assert "gyro at 400.0 Hz and accelerometer at 250.0 Hz became one IMU" in caplog.text
     assert "delay" in caplog.text
-    assert "2 gyro samples have no accelerometer sample near them" in caplog.text
+    assert "gyro samples without an accelerometer sample near them: 2" in caplog.text
 
 
 def test_debias_writes_one_message_a_gyro_message(tmp_path):
