@@ -200,6 +200,12 @@ def test_what_a_simulation_folds_is_no_effect_but_makes_the_low_pass_less_sure()
     assert "accel scale" in remark
 
 
+def test_the_low_pass_of_a_remark_is_said_to_be_of_the_simulations_noise_if_none_is_found() -> None:
+    now = fit([planted.weighed(planted.pair(planted.rich(duration_s=DURATION_S)))], ())
+    (remark,) = Selection((), now, now, 1, within_error=("mount_resonance",)).remarks
+    assert "a low-pass, without which the simulation is noisier" in remark
+
+
 def test_a_filter_that_only_fits_with_an_endless_damping_is_of_first_order() -> None:
     """Its two parameters have one value together: what came in beside them was chosen by the last bits of a processor."""
     (found,) = low_passed(0, (230.0, 270.0)).selected
