@@ -21,8 +21,8 @@ Steps = Float64[np.ndarray, " w"]
 class WalkLikelihood(NamedTuple):
     """Likelihood of sizes of a walk: squares left, logarithms of determinants.
 
-    The determinants are those beside all parameters, and beside a constant alone. `fitted` are the squares of the residual as it
-    was fitted, beside the best constant.
+    The determinants are those beside all parameters, and beside a constant alone. `fitted` are the squares of the residual as
+    it was fitted, beside the best constant.
     """
 
     squares: Steps
@@ -56,9 +56,9 @@ def walk_likelihood(
 ) -> WalkLikelihood | None:
     """Likelihood of walks by the variance of their steps from block to block.
 
-    The variances are in units of a sample's white noise. `derivatives` are the residual's by what was fitted, a constant the first
-    of them. The restricted likelihood is that of what no value of the parameters changes (Patterson and Thompson, Biometrika 1971):
-    what they took up is no evidence against a walk. None where they leave too few blocks.
+    The variances are in units of a sample's white noise. `derivatives` are the residual's by what was fitted, a constant the
+    first of them. The restricted likelihood is that of what no value of the parameters changes (Patterson and Thompson,
+    Biometrika 1971): what they took up is no evidence against a walk. None where they leave too few blocks.
     """
     names, inverse, count = np.unique(block, return_inverse=True, return_counts=True)
     means = np.array([np.bincount(inverse, weights=row) for row in (residual, *derivatives)])

@@ -52,7 +52,9 @@ def test_a_convention_is_named_and_undone(pair, gyro: np.ndarray, accel: np.ndar
     ("axes", "factor", "named"),
     [(np.diag([1.0, -1.0, -1.0]), 1.0, ["permuted_axes"]), (np.eye(3), 1.0 / OTHER_UNIT["accel"], ["wrong_unit"])],
 )
-def test_a_large_lever_arm_hides_no_convention_whose_axes_the_gyro_shows(axes: np.ndarray, factor: float, named: list[str]) -> None:
+def test_a_large_lever_arm_hides_no_convention_whose_axes_the_gyro_shows(
+    axes: np.ndarray, factor: float, named: list[str]
+) -> None:
     far = planted.pair(planted.rich(2, SECONDS), {"lever_arm": [1.0, 0.0, 1.0]})
     read = np.concatenate([far.real[:, :3] @ axes, factor * far.real[:, 3:] @ axes], axis=1)
     (after,), found = with_common_conventions([replace(far, real=read)])
