@@ -246,7 +246,7 @@ def _parameters(pairs: Sequence[AlignedLog], selected: SelectedEffect) -> dict[s
     if selected.effect.name == JITTER:
         jitter_s = np.concatenate([pair.stamp_s - timestamps.even(pair.stamp_s)[0] for pair in pairs])
         std = float(np.hypot(jitter_s.std(), max(pair.batched_s for pair in pairs if isinstance(pair, Pair))))
-        return {"std": Estimate(std, std / np.sqrt(2.0 * len(jitter_s)), "s")}
+        return {"std": Estimate(std, float(std / np.sqrt(2.0 * len(jitter_s))), "s")}
     fitted = {
         parameter.name: Estimate(float(value), float(std), parameter.unit)
         for parameter, value, std in zip(selected.effect.parameters, selected.theta, selected.std, strict=True)

@@ -19,10 +19,16 @@ Steps = Float64[np.ndarray, " w"]
 
 
 class WalkLikelihood(NamedTuple):
-    """Restricted likelihood of sizes of a walk: squares left, logarithms of determinants."""
+    """Likelihood of sizes of a walk: squares left, logarithms of determinants.
+
+    The determinants are those beside all parameters, and beside a constant alone. `fitted` are the squares of the residual as
+    it was fitted, beside the best constant.
+    """
 
     squares: Steps
     log_determinant: Steps
+    beside_constant: Steps
+    fitted: float
     free: int
 
     def white(self) -> Steps:
@@ -30,12 +36,16 @@ class WalkLikelihood(NamedTuple):
         return np.asarray(self.squares / self.free)
 
     def of_any_noise(self) -> Steps:
-        """Log-likelihood with the best variance of the white noise."""
+        """Restricted log-likelihood with the best variance of the white noise."""
         return np.asarray(-0.5 * (self.free * np.log(self.white()) + self.log_determinant))
 
-    def of_noise(self, variance: float) -> Steps:
-        """Log-likelihood with a known variance of the white noise."""
-        return np.asarray(-0.5 * (self.squares / variance + self.log_determinant))
+    def gain(self, variance: float) -> Steps:
+        """Gain in log-likelihood over the residual as it was fitted, with a known variance of the white noise.
+
+        It is restricted by the constant alone, which all fits have. Restricted by all parameters it does not compare fits of
+        different ones: each would be worth the logarithm of what the walk adds to its variance.
+        """
+        return np.asarray(0.5 * ((self.fitted - self.squares) / variance - self.beside_constant))
 
 
 def walk_likelihood(
@@ -46,9 +56,9 @@ def walk_likelihood(
 ) -> WalkLikelihood | None:
     """Likelihood of walks by the variance of their steps from block to block.
 
-    The variances are in units of a sample's white noise. `derivatives` are the residual's by what was fitted, a constant among
-    them. The likelihood is that of what no value of the parameters changes (Patterson and Thompson, Biometrika 1971): what
-    they took up is no evidence against a walk. None where they leave too few blocks.
+    The variances are in units of a sample's white noise. `derivatives` are the residual's by what was fitted, a constant the
+    first of them. The restricted likelihood is that of what no value of the parameters changes (Patterson and Thompson,
+    Biometrika 1971): what they took up is no evidence against a walk. None where they leave too few blocks.
     """
     names, inverse, count = np.unique(block, return_inverse=True, return_counts=True)
     means = np.array([np.bincount(inverse, weights=row) for row in (residual, *derivatives)])
@@ -60,12 +70,14 @@ def walk_likelihood(
     free = len(y) - len(X)
     if free <= len(X):
         return None
-    squares, log_determinant = np.zeros(len(steps)), np.zeros(len(steps))
+    constant = fitted[0] / max(float(np.linalg.norm(fitted[0])), 1e-300)
+    squares, log_determinant, beside_constant = np.zeros((3, len(steps)))
     for k, variance in enumerate(1.0 + steps[:, None] * np.maximum(power, 0.0)):
         N, g = X / variance @ X.T, X / variance @ y
         squares[k] = y / variance @ y - g @ np.linalg.solve(N, g)
         log_determinant[k] = np.log(variance).sum() + np.linalg.slogdet(N)[1]
-    return WalkLikelihood(squares, log_determinant, free)
+        beside_constant[k] = np.log(variance).sum() + np.log(max(float(constant / variance @ constant), 1e-300))
+    return WalkLikelihood(squares, log_determinant, beside_constant, float(y @ y - (y @ constant) ** 2), free)
 
 
 @lru_cache(maxsize=8)

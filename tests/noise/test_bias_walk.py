@@ -8,6 +8,7 @@ import pytest
 from imutool.noise.bias_walk import walk_likelihood, without_walk
 
 SAMPLES, EACH = 12_000, 50
+CHI_SQUARE_STD = 4.0  # of eight parameters
 STEPS = np.append(0.0, np.geomspace(1e-7, 1e-2, 14))  # of a sample, by its white noise
 
 
@@ -40,6 +41,28 @@ def test_a_walk_is_found_though_slow_effects_took_it_up() -> None:
     t = np.linspace(0.0, 1.0, SAMPLES)
     gained = gains(residual(1e-4), *(t**k for k in range(1, 6)))
     assert 0.2 < STEPS[np.argmax(gained)] / 1e-4 < 5.0
+
+
+def test_slow_effects_gain_what_chance_gives_beside_a_walk() -> None:
+    """The restricted likelihood gives each of them some squares more: a walk was taken for a curve of the time."""
+    t, gained = np.linspace(0.0, 1.0, SAMPLES), []
+    slow = np.stack([t**k for k in range(9)])
+    for seed in range(20):
+        x, left = residual(1e-3, seed), []
+        for A in (slow[:1], slow):
+            rest = x - np.linalg.lstsq(A.T, x)[0] @ A
+            likely = walk_likelihood(rest, A, np.arange(SAMPLES) // EACH, STEPS * EACH)
+            assert likely is not None
+            left.append(float(rest @ rest) - 2.0 * float(likely.gain(1.0).max()))
+        gained.append(left[0] - left[1])
+    assert np.mean(gained) == pytest.approx(8.0, abs=2.0 * CHI_SQUARE_STD / len(gained) ** 0.5)
+
+
+def test_what_a_fit_did_not_reach_counts_for_the_walk() -> None:
+    A = np.stack([np.ones(SAMPLES), np.linspace(0.0, 1.0, SAMPLES)])
+    likely = walk_likelihood(0.1 * A[1], A, np.arange(SAMPLES) // EACH, STEPS * EACH)
+    assert likely is not None
+    assert likely.gain(1.0)[0] == pytest.approx(0.5 * SAMPLES * 0.1**2 / 12.0, rel=1e-3)
 
 
 def test_too_few_blocks_say_nothing_of_a_walk() -> None:

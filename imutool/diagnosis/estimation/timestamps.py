@@ -250,7 +250,7 @@ def late_stamps(pairs: Sequence[Pair]) -> list[Finding]:
     all_s = np.concatenate(lateness)
     std = float(all_s.std())
     length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
-    parameters = {"std": Estimate(std, std / np.sqrt(2.0 * len(all_s)), "s")}
+    parameters = {"std": Estimate(std, float(std / np.sqrt(2.0 * len(all_s))), "s")}
     held_out = HeldOut(0.0, 0.0, "-", round(length, 1))
     return [Finding("timestamp_jitter", "both", 0.0, chance, chance, parameters, UNEVEN, held_out)]
 

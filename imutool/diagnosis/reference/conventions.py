@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.units import ASCII_UNITS, AXES, SENSORS, Sensor
 
 EXPLAINED = 0.03  # of the motion's squares: a convention leaves less, unless the mount is turned by 10 degrees besides
+EXPLAINED_AS_OTHER = 0.3  # likewise, if the other sensor shows the same axes: a large lever arm is left beside a convention
 UNLIKE = 0.1  # loss of correlation with the motion that another order of axes may bring: at rest no order correlates
 CONSTANT = 0.1  # of the squares of the specific force: a bias and a tilt leave less of them, a wrong convention most of gravity
 Readings = Float64[np.ndarray, "n 3"]
@@ -31,7 +33,7 @@ def with_common_conventions(pairs: Sequence[Pair], of: str = "simulation") -> tu
 
     `of` is what the reference is called.
     """
-    changes: dict[Sensor, tuple[float, Matrix]] = {}
+    shown: dict[Sensor, _Convention] = {}
     for k, sensor in enumerate(SENSORS):
         part = slice(3 * k, 3 * k + 3)
         rows = [pair.usable[:, part].all(axis=1) for pair in pairs]
@@ -39,7 +41,8 @@ def with_common_conventions(pairs: Sequence[Pair], of: str = "simulation") -> tu
             np.concatenate([values[:, part][row] for values, row in zip(each, rows, strict=True)])
             for each in ([pair.real for pair in pairs], [expected(pair, ()) for pair in pairs])
         )
-        changes[sensor] = _convention(sensor, y, x)
+        shown[sensor] = _convention(sensor, y, x)
+    changes = {sensor: one.beside(*(other for other in shown.values() if other is not one)) for sensor, one in shown.items()}
     if all(factor == 1.0 and np.array_equal(P, np.eye(3)) for factor, P in changes.values()):
         return [*map(_with_z_up, pairs)], []
     after = [_with_z_up(_converted(pair, changes)) for pair in pairs]
@@ -55,9 +58,22 @@ def _with_z_up(pair: Pair) -> Pair:
     return replace(pair, ideal=replace(pair.ideal, R_wb=TO_Z_UP["-z"] @ R_wb)) if max(up) < 0.0 else pair
 
 
-def _convention(sensor: Sensor, y: Readings, x: Readings) -> tuple[float, Matrix]:
-    """Factor and axes P with factor y P = x, as far as the motion shows them."""
-    same = 1.0, np.eye(3)
+class _Convention(NamedTuple):
+    """Factor and axes P with factor y P = x as far as the motion shows them, and the share of the squares that they leave."""
+
+    factor: float
+    P: Matrix
+    left: float
+
+    def beside(self, other: _Convention) -> tuple[float, Matrix]:
+        """Factor and axes, if they explain the motion; less of it where the other sensor shows the same axes."""
+        alike = other.left < EXPLAINED and np.array_equal(self.P, other.P)
+        return self[:2] if self.left < (EXPLAINED_AS_OTHER if alike else EXPLAINED) else (1.0, np.eye(3))
+
+
+def _convention(sensor: Sensor, y: Readings, x: Readings) -> _Convention:
+    """Convention that the motion shows best; the same as the reference if gravity or the correlation contradicts it."""
+    same = _Convention(1.0, np.eye(3), np.inf)
     if len(y) == 0 or not y.any():
         return same
     like = Hypotheses(x[:, :, None], x[:, :, None], free_bias=sensor == "gyro")
@@ -67,9 +83,9 @@ def _convention(sensor: Sensor, y: Readings, x: Readings) -> tuple[float, Matrix
     turned = y @ P
     left = factor * turned - x
     size = max(float((x**2).mean(axis=0).sum()), np.finfo(np.float64).tiny)
-    shown = float(left.var(axis=0).sum()) < EXPLAINED * size
-    shown &= sensor == "gyro" or float((left.mean(axis=0) ** 2).sum()) < CONSTANT * size
-    return (factor, P) if shown and _correlation(turned, x) > _correlation(y, x) - UNLIKE else same
+    shown = sensor == "gyro" or float((left.mean(axis=0) ** 2).sum()) < CONSTANT * size
+    shown &= _correlation(turned, x) > _correlation(y, x) - UNLIKE
+    return _Convention(factor, P, float(left.var(axis=0).sum()) / size) if shown else same
 
 
 def _correlation(y: Readings, x: Readings) -> float:

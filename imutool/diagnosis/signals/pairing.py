@@ -7,8 +7,9 @@ covariances, and what is the same in both.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from imutool.geometry import quaternion
 from imutool.mcap_io.codec.schemas import ODOMETRY, PRESSURE
 from imutool.mcap_io.fields import Fields
 from imutool.sensor.channels import is_quantity
+from imutool.units import AXES
 
 MOST_COMPARED, MOST_DRIVERS = 24, 6
 LISTED = 12
@@ -37,6 +39,7 @@ TRIPLES: Mapping[str, tuple[tuple[str, str, str], str, str]] = {
     MAGNETIC: (("magnetic_field.x", "magnetic_field.y", "magnetic_field.z"), "magnetic", "T"),
     GNSS: (("longitude", "latitude", "altitude"), "gnss", "m"),
 }
+NUMBER = "data"  # the field of a topic with one number, as the columns of a table become topics
 UNIT_UNITS = {"linear": "m/s", "angular": "rad/s"}
 
 
@@ -58,7 +61,10 @@ def paired(real: Location, sim: Location, clock: ClockDifference | None = None) 
     own, other, topics = read_both(real, sim)
     remarks, pairs, same = _remarks(own, other, topics), list[SignalPair](), list[str]()
     wheels = _wheels(own, other, topics)
-    found = (pair for topic, theirs in topics.items() for pair in _of_topic(own, other, topic, theirs, wheels))
+    fields = dict(_of_three_topics(own, other, topics))
+    parts = {topic for three in fields for topic in three}
+    alone = ((topic, theirs) for topic, theirs in topics.items() if topic not in parts)
+    found = chain(fields.values(), *(_of_topic(own, other, topic, theirs, wheels) for topic, theirs in alone))
     for given in (on_recorded_clock(pair, clock) for pair in found):
         if is_copy(given, DiagnoseSettings()):
             same.extend(given.names)
@@ -74,7 +80,7 @@ def paired(real: Location, sim: Location, clock: ClockDifference | None = None) 
     remarks += (
         rate_of + _listed("The same in both logs", same) + _listed(f"Not compared, for at most {MOST_COMPARED} are", untried)
     )
-    return Pairing(tuple(pairs), _drivers(own, pairs), tuple(remarks))
+    return Pairing(tuple(pairs), _drivers(own, pairs, parts), tuple(remarks))
 
 
 def _listed(what: str, names: list[str]) -> list[str]:
@@ -140,6 +146,22 @@ def _of_topic(
                 yield replace(unwrapped(pair), units=(pair.units[0] or unit,))
 
 
+def _of_three_topics(
+    real: LogFields, sim: LogFields, topics: Mapping[str, str]
+) -> Iterator[tuple[tuple[str, ...], SignalPair]]:
+    """Magnetic fields whose x, y and z are topics of their own, with these topics."""
+    shared = [topic for topic, theirs in topics.items() if NUMBER in real.fields[topic] and NUMBER in sim.fields[theirs]]
+    mine, other = (
+        {topic: side.fields[of][NUMBER] for topic, of in zip(shared, names, strict=True)}
+        for side, names in ((real, shared), (sim, [topics[topic] for topic in shared]))
+    )
+    for names in field_vectors("", mine, other):
+        k = next(k for k, letters in enumerate(zip(*names, strict=True)) if len(set(letters)) > 1)
+        name = f"{names[0][:k]}xyz{names[0][k + 1 :]}"
+        pair = SignalPair.of_columns(name, names, "magnetic", ("",) * 3, mine, other, _attitude(real))
+        yield names, replace(pair, names=tuple(f"{name}.{axis}" for axis in AXES))
+
+
 def _unit(path: str) -> str:
     return next((unit for word, unit in UNIT_UNITS.items() if word in path.split(".")), "")
 
@@ -187,13 +209,16 @@ def _speed(side: LogFields) -> dict[str, Fields]:
     return {}
 
 
-def _drivers(side: LogFields, pairs: Sequence[SignalPair]) -> dict[str, Fields]:
-    """Numbers of the recording that may drive a misfit: temperatures, no motion, what is compared itself last."""
+def _drivers(side: LogFields, pairs: Sequence[SignalPair], parts: Set[str]) -> dict[str, Fields]:
+    """Numbers of the recording that may drive a misfit: temperatures, no motion, what is compared itself last.
+
+    Topics that are `parts` of a field are none.
+    """
     compared = {name: pair.kind for pair in pairs for name in pair.names}
     found = {
         f"{topic}.{path}": values
         for topic, fields in side.fields.items()
-        if side.schemas[topic] not in ELSEWHERE | {JOINTS, ODOMETRY, *TRIPLES}
+        if side.schemas[topic] not in ELSEWHERE | {JOINTS, ODOMETRY, *TRIPLES} and topic not in parts
         for path, values in fields.items()
         if compared.get(f"{topic}.{path}", "number") == "number"
         and is_quantity(values)

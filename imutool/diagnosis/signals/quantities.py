@@ -25,6 +25,8 @@ EARTH_M, FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS 84
 FACTORS = {180.0 / np.pi: "degrees", 100.0: "hundreds", 1e3: "thousands", 1e4: "gauss", 1e6: "millions"}
 """Factors between units of one quantity, either way round."""
 MAGNETIC = re.compile(r"magnet|(?<![a-z])mag(?![a-z])|compass")  # in the name of a field, or of its topic
+FIRST = re.compile(r"\[0\]$|(?<![A-Za-z])[xX](?![A-Za-z])")  # of three numbers
+AXES_OF = ("[0]", "[1]", "[2]", "[3]"), tuple("xyzw"), tuple("XYZW")  # with a fourth, four numbers are no field
 PRESSURE = re.compile(r"press[^.]*(\.(data|value))?$")  # in its own, or in that of a topic with one number
 UNITS = {
     "magnetic": {"T": 1.0, "G": 1e-4, "µT": 1e-6, "mG": 1e-7, "nT": 1e-9},
@@ -40,12 +42,13 @@ def field_vectors(topic: str, real: Mapping[str, Fields], sim: Mapping[str, Fiel
     Each is an array of three, or x, y and z, is named a field or compass, and is as large as the Earth's field.
     """
     for path in real:
-        for first, others in (("[0]", ("[1]", "[2]")), (".x", (".y", ".z"))):
-            stem = path.removesuffix(first)
-            triple = (path, *(f"{stem}{other}" for other in others))
-            named = stem != path and MAGNETIC.search(f"{topic}.{stem}".lower()) is not None and f"{stem}[3]" not in real
-            if named and all(path in side and is_quantity(side[path]) for path in triple for side in (real, sim)):
-                columns = (stacked([side[path] for path in triple])[1] for side in (real, sim))
+        for first in FIRST.finditer(path):
+            axes = next(axes for axes in AXES_OF if axes[0] == first[0])
+            triple = tuple(f"{path[: first.start()]}{axis}{path[first.end() :]}" for axis in axes[:3])
+            named = MAGNETIC.search(f"{topic}.{path}".lower()) is not None
+            named &= f"{path[: first.start()]}{axes[3]}{path[first.end() :]}" not in real
+            if named and all(one in side and is_quantity(side[one]) for one in triple for side in (real, sim)):
+                columns = (stacked([side[one] for one in triple])[1] for side in (real, sim))
                 if None not in [_unit("magnetic", values) for values in columns]:
                     yield triple
 

@@ -86,9 +86,8 @@ class Design(NamedTuple):
     @property
     def kept(self) -> Complex128[np.ndarray, " order"]:
         """What exponential smoothing keeps of the sample before, by pole."""
-        root = 0.0 if self.zeta is None else cmath.sqrt(self.zeta**2 - 1.0)
-        zeta = 1.0 if self.zeta is None else self.zeta
-        poles = np.array([-zeta - root, -zeta + root][: 1 if self.zeta is None else 2], complex)
+        faster = 1.0 if self.zeta is None else self.zeta + cmath.sqrt(self.zeta**2 - 1.0)
+        poles = np.array([-faster, -1.0 / faster][: 1 if self.zeta is None else 2], complex)
         return np.asarray(np.exp(2.0 * np.pi * self.cutoff_hz / self.smoothing_hz * poles))
 
     @property

@@ -48,8 +48,8 @@ def _design(theta: Theta) -> Design:
 @lru_cache(maxsize=64)
 def _second_order(a: float, zeta: float) -> Filter:
     """H for w_c of `a` rad a sample."""
-    root = cmath.sqrt(zeta**2 - 1.0)
-    pole, other = cmath.exp(-a * (zeta - root)), cmath.exp(-a * (zeta + root))
+    faster = zeta + cmath.sqrt(zeta**2 - 1.0)  # the poles' product is one, whose difference would cancel beside a large damping
+    pole, other = cmath.exp(-a / faster), cmath.exp(-a * faster)
     s = 1j * OMEGA
     return Filter.of(a**2 / (s**2 + 2.0 * zeta * a * s + a**2), np.array([1.0, -(pole + other).real, (pole * other).real]))
 

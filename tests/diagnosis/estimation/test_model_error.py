@@ -193,11 +193,23 @@ def test_a_small_scale_is_told_beside_a_low_pass_by_slow_motion() -> None:
 
 def test_what_a_simulation_folds_is_no_effect_but_makes_the_low_pass_less_sure() -> None:
     """A vibration near the sample rate looks like slow motion, which the sensor does not read."""
-    found = low_passed(6, (230.0, 270.0))  # of seed 0 the fit ends elsewhere on other processors
+    found = low_passed(6, (230.0, 270.0))
     assert low_pass(found).std[0] > 0.1 * CUTOFF_HZ
     assert len(found.selected) == 1
     (remark,) = found.remarks
     assert "accel scale" in remark
+
+
+def test_the_low_pass_of_a_remark_is_said_to_be_of_the_simulations_noise_if_none_is_found() -> None:
+    now = fit([planted.weighed(planted.pair(planted.rich(duration_s=DURATION_S)))], ())
+    (remark,) = Selection((), now, now, 1, within_error=("mount_resonance",)).remarks
+    assert "a low-pass, without which the simulation is noisier" in remark
+
+
+def test_a_filter_that_only_fits_with_an_endless_damping_is_of_first_order() -> None:
+    """Its two parameters have one value together: what came in beside them was chosen by the last bits of a processor."""
+    (found,) = low_passed(0, (230.0, 270.0)).selected
+    assert found.effect.key == "low_pass:accel"
 
 
 @pytest.mark.parametrize("seed", seeds(1))

@@ -48,6 +48,20 @@ def test_a_convention_is_named_and_undone(pair, gyro: np.ndarray, accel: np.ndar
         assert one.share > 0.9
 
 
+@pytest.mark.parametrize(
+    ("axes", "factor", "named"),
+    [(np.diag([1.0, -1.0, -1.0]), 1.0, ["permuted_axes"]), (np.eye(3), 1.0 / OTHER_UNIT["accel"], ["wrong_unit"])],
+)
+def test_a_large_lever_arm_hides_no_convention_whose_axes_the_gyro_shows(
+    axes: np.ndarray, factor: float, named: list[str]
+) -> None:
+    far = planted.pair(planted.rich(2, SECONDS), {"lever_arm": [1.0, 0.0, 1.0]})
+    read = np.concatenate([far.real[:, :3] @ axes, factor * far.real[:, 3:] @ axes], axis=1)
+    (after,), found = with_common_conventions([replace(far, real=read)])
+    assert [one.effect for one in found] == named
+    assert after.real == pytest.approx(far.real)
+
+
 @pytest.mark.parametrize("constant", [60.0, 90.0])
 def test_a_large_constant_of_one_axis_is_no_unit(constant: float) -> None:
     """As a battery's voltage leaves it: in g it would be a motionless sensor, with the other constant even one turned aside."""

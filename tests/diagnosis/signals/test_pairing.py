@@ -336,6 +336,22 @@ def test_a_field_and_an_air_pressure_are_known_in_any_message_by_their_names_and
     assert sum("magnitude" in name for name in pairs) == 3
 
 
+def test_columns_of_a_table_that_are_a_magnetic_field_are_compared_together(tmp_path: Path) -> None:
+    """Each alone would have a constant of its own, and hard iron is three constants."""
+    turned = np.stack([wave(1), wave(2), 2.0 + wave(3)], axis=1)
+    field = 50.0 * turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    iron = np.array([12.0, -5.0, 3.0])
+    real, sim = (
+        {f"/mag_{axis}_uT": (NUMBER, T, x[:, None]) for axis, x in zip("xyz", values.T, strict=True)}
+        for values in (field + iron, field)
+    )
+    pairs = {pair.name: pair for pair in logged(tmp_path, real, sim, (), ()).pairs}
+    magnetic = pairs["/mag_xyz_uT"]
+    assert (magnetic.kind, magnetic.units, magnetic.names[0]) == ("magnetic", ("T",) * 3, "/mag_xyz_uT.x")
+    assert np.allclose(magnetic.real - magnetic.sim, 1e-6 * iron)
+    assert len(pairs) == 1
+
+
 def test_a_current_that_both_logs_hold_may_drive_a_misfit(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     for name, noise in (("real", 0.01), ("sim", 0.0)):

@@ -86,6 +86,8 @@ def with_form_of_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequence
         two = _of_each_sensor(now, k, named)
         trial = fit(logs, two, near=now) if two else now
         if bic(trial) < bic(now) - settings.model_error_low_pass / error * max(settings.clearly_better, errs):
+            for sensor in SENSORS:  # a second order that only fits with an endless damping is a first one
+                trial = _with_own_form(logs, trial, (sensor,), named)
             return with_form_of_low_pass(logs, trial, named)
     return now
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.observability import LOW_PASSES
 from imutool.sensor.effect import Effect, Theta
 
 
@@ -47,7 +48,9 @@ class Selection:
         if not self.within_error:
             return ()
         names = ", ".join(name.replace("_", " ") for name in self.within_error)
-        why = "may be the error of the low-pass (the samples of a simulation alias its vibrations)"
+        named = any(one.effect.name in LOW_PASSES for one in self.selected)
+        which = "the low-pass" if named else "a low-pass, without which the simulation is noisier than the recording"
+        why = f"may be the error of {which} (the samples of a simulation alias its vibrations)"
         return (f"{names}: more than chance, but {why}, so not among the findings",)
 
 

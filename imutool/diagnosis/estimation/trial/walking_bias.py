@@ -38,8 +38,9 @@ def with_bias_walk(found: Fit) -> Fit:
 def squares_of_walk(found: Fit, like: Fit, *, of_any_speed: bool = False) -> float:
     """Squares that random walks of the biases explain of a fit's residual.
 
-    They are twice the gain in log-likelihood; none of a sensor whose noise has its walk already. `like` is the fit whose
-    derivatives serve, with the same effects and perhaps more. What depends on time alone is weighed against walks of any speed.
+    They are twice the gain in log-likelihood, and what the fit itself did not reach; none of a sensor whose noise has its walk
+    already. `like` is the fit whose derivatives serve, with the same effects and perhaps more. What depends on time alone is
+    weighed against walks of any speed.
     """
     gained, noise = 0.0, max(1.0, like.reduced_chi_square)
     kept = [j for key in found.keys for j in range(*like.place(key).indices(len(like.prior)))]
@@ -52,8 +53,8 @@ def squares_of_walk(found: Fit, like: Fit, *, of_any_speed: bool = False) -> flo
         for axes, steps, each in _walks(log, found.residuals[k], on_axis, of_any_speed=of_any_speed):
             if log.whiten.walk is not None and log.whiten.walk[axes].any():
                 continue
-            likely = sum((one.of_noise(noise) for one in each), start=np.zeros(len(steps)))
-            gained += 2.0 * noise * float(likely[int(np.argmax(likely)) if of_any_speed else _likeliest(likely)] - likely[0])
+            likely = sum((one.gain(noise) for one in each), start=np.zeros(len(steps)))
+            gained += 2.0 * noise * float(likely[int(np.argmax(likely)) if of_any_speed else _likeliest(likely)])
     return gained
 
 
