@@ -435,14 +435,15 @@ def test_the_covariance_of_live_samples_is_that_of_the_recording(logs: Path) -> 
         _ = plain.covariance
 
 
-def test_a_copy_of_a_live_debiaser_goes_its_own_way(logs: Path) -> None:
+@pytest.mark.parametrize("copied_by", [copy.copy, copy.deepcopy])
+def test_a_copy_of_a_live_debiaser_goes_its_own_way(copied_by: Callable[[Any], Any], logs: Path) -> None:
     imu, model = imutool.read(logs / "flight_2.mcap").imu, imutool.load_model(logs / "linear.safetensors")
     samples = list(zip(imu.t_ns.tolist(), imu.gyro, imu.accel, strict=True))[:800]
     alone, copied = imutool.OnlineDebiaser(model), imutool.OnlineDebiaser(model)
     for online in (alone, copied):
         for sample in samples[:400]:
             online(*sample)
-    branch = copy.deepcopy(copied)
+    branch = copied_by(copied)
     for stamp_ns, gyro, accel in samples[400:]:
         branch(stamp_ns, gyro + 0.3, accel)
     for sample in samples[400:]:
