@@ -28,6 +28,7 @@ from support.loaded import loaded
 import imutool
 from imutool.cleaning.survey import raw_batches
 from imutool.cli.demo import write_asl
+from imutool.viewing.rerun.live import is_complete_rrd
 
 ROOT = Path(__file__).parents[1]
 IMPORT_SHARE = 0.1  # of the time that `import torch` takes
@@ -476,6 +477,17 @@ def test_a_view_leaves_the_environment_as_it_was(tmp_path: Path) -> None:
     code = f"import os, imutool\nbefore = dict(os.environ)\n{shown}\nprint(before == dict(os.environ))"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("True\n", "")
+
+
+def test_what_a_live_view_showed_until_ctrl_c_is_saved(tmp_path: Path) -> None:
+    def show(zeros: np.ndarray) -> None:
+        with imutool.watch("x", save=tmp_path / "x.rrd") as live:
+            live.add(STILL.imu, zeros, zeros + 1.0)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        show(np.zeros((len(STILL.imu), 6)))
+    assert is_complete_rrd(tmp_path / "x.rrd")
 
 
 def test_a_misspelt_option_of_view_is_named_before_any_work() -> None:
