@@ -269,6 +269,16 @@ def test_a_shaken_sensor_is_said_to_vibrate(tmp_path: Path) -> None:
     assert "gyro's deviation on x, y, z" in said[0]
 
 
+def test_a_sensor_that_rests_all_the_time_has_no_noise_in_motion(tmp_path: Path) -> None:
+    imu = still(60.0)
+    truth = Poses(imu.t_ns, np.zeros((len(imu), 3)), np.tile([1.0, 0.0, 0.0, 0.0], (len(imu), 1)))
+    write(Recording("still", imu, truths={"/pose": truth}), tmp_path / "still.mcap")
+    found = identify(tmp_path / "still.mcap")
+    assert found.noise.accel_density == pytest.approx((2e-3,) * 3, rel=DENSITY_TOLERANCE)
+    assert found.in_motion is None  # a fitted matrix takes up noise: 36 % of the density were gone after 1000 s
+    assert "in motion: the sensor rests nearly all the time" in found.remarks
+
+
 def test_a_log_with_neither_rest_nor_truth_is_refused(tmp_path: Path) -> None:
     imu = still(20.0)
     turning = Imu(imu.t_ns, imu.gyro + np.sin(np.arange(len(imu)) / 50.0)[:, None], imu.accel)
