@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -93,6 +93,17 @@ def evaluate(
     return results
 
 
+def debiased_by(about: Mapping[str, str], topic: str) -> str:
+    """Name of the model that has debiased an IMU already; empty for a raw one.
+
+    `about` is the record `imutool` of its log.
+    """
+    from imutool.debiasing import DEBIASED_BY, SUFFIX
+
+    is_derived = topic == f"{about.get('source_topic')}{SUFFIX}"
+    return about.get(DEBIASED_BY) or (about.get("model", "") if is_derived else "")
+
+
 def _debiased(log: Path, stretches: Sequence[Recording], truth: str | None) -> Sequence[Imu | None]:
     """The samples of the same stretches that the log has debiased."""
     from imutool.debiasing import SUFFIX
@@ -125,6 +136,8 @@ def _evaluated(
         truth = replace(truth, p_wb=np.zeros_like(truth.p_wb), v_w=None)
     recording = replace(recording, truths={next(iter(recording.truths)): with_velocity(truth)})
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
+    if by := debiased_by(about, recording.imu_topic):
+        logger.warning("%s: `%s` is debiased already, by %s: a model corrects it once more", recording.name, RAW, by)
     recorded = [(RAW, recording.imu, None, None)]
     recorded += [] if debiased is None else [(str(about.get("model") or "debiased"), debiased, None, None)]
     found = started(recording, models, init, log, smooth=smooth, refused=refused)

@@ -376,6 +376,18 @@ def test_a_debiased_recording_is_not_debiased_again(logs: Path, tmp_path: Path) 
     assert imutool.debias(raw, "static").model == "static"
 
 
+def test_a_channel_that_is_debiased_already_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    imutool.write(tmp_path / "raw.mcap", imutool.example_recording(duration_s=5.0))
+    imutool.debias(tmp_path / "raw.mcap", tmp_path / "out.mcap", model="static")
+    channel = imutool.read(tmp_path / "out.mcap", imu="/imu0/debiased")
+    with pytest.raises(imutool.DataError, match="debiased already, by static"):
+        imutool.debias(channel, "static")
+    imutool.evaluate(tmp_path / "out.mcap")
+    assert caplog.messages == []
+    imutool.evaluate(channel, models=["static"])
+    assert caplog.messages == ["flight_1: `raw` is debiased already, by static: a model corrects it once more"]
+
+
 def test_results_print_briefly(logs: Path) -> None:
     log, model = logs / "flight_2.mcap", imutool.load_model(logs / "linear.safetensors")
     still = imutool.read(log).imu.rows(slice(0, 400))
