@@ -84,6 +84,8 @@ def evaluate(
     in_log = [None] * len(stretches) if models else _debiased(log, stretches, truth)
     for stretch, debiased in zip(stretches, in_log, strict=True):
         recording = replace(stretch, imu=measured_imu(stretch.imu, f"{log} {stretch.imu_topic}"))
+        if by := debiased_by(stretch.metadata.get("imutool", {}), stretch.imu_topic):
+            logger.warning("%s: `%s` is debiased already, by %s: a model corrects it once more", stretch.name, RAW, by)
         aids = None
         if asked is not None:
             with Log(log) as opened:
@@ -136,8 +138,6 @@ def _evaluated(
         truth = replace(truth, p_wb=np.zeros_like(truth.p_wb), v_w=None)
     recording = replace(recording, truths={next(iter(recording.truths)): with_velocity(truth)})
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
-    if by := debiased_by(about, recording.imu_topic):
-        logger.warning("%s: `%s` is debiased already, by %s: a model corrects it once more", recording.name, RAW, by)
     recorded = [(RAW, recording.imu, None, None)]
     recorded += [] if debiased is None else [(str(about.get("model") or "debiased"), debiased, None, None)]
     found = started(recording, models, init, log, smooth=smooth, refused=refused)

@@ -101,7 +101,7 @@ def sample_period_s(rows: Columns) -> float:
 
 
 def coarse_axes(stretches: Sequence[Samples]) -> list[bool]:
-    """Axes that hardly leave a reading and its neighbour: their scatter shows the digits, and no noise."""
+    """Axes that hardly leave two neighbouring readings: they show digits, and no noise."""
     variance = np.mean([part.var(axis=0) for part in stretches], axis=0)
     steps = [np.diff(np.unique(column)).min(initial=np.inf) for column in np.concatenate(stretches).T]
     return [bool(np.sqrt(v) < COARSE * step) for v, step in zip(variance, steps, strict=True)]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import threading
 from types import TracebackType
 
 from imutool.errors import ConfigError, ImutoolError, LogError
 from imutool.file_location import Location, compression, io_errors, open_location, reason
 from imutool.mcap_io.codec.records import HEAD, crc32
+from imutool.processes.system import read_at
 
 BLOCK_BYTES = 1 << 20
 SHORT_BYTES, AHEAD_BYTES = 512, 1 << 13  # a read of at most so many bytes of a local file takes as many at once
@@ -72,8 +72,8 @@ class Source:
 
     def _part(self, offset: int, length: int) -> bytes:
         """Some of these bytes at least."""
-        if self._is_local and hasattr(os, "pread"):  # the place of a file is shared, also with forked processes
-            return os.pread(self.file.fileno(), length, offset)
+        if self._is_local and (part := read_at(self.file, offset, length)) is not None:
+            return part
         with self._moves:
             self.file.seek(offset)
             return self.file.read(length)
