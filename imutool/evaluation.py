@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -84,6 +84,8 @@ def evaluate(
     in_log = [None] * len(stretches) if models else _debiased(log, stretches, truth)
     for stretch, debiased in zip(stretches, in_log, strict=True):
         recording = replace(stretch, imu=measured_imu(stretch.imu, f"{log} {stretch.imu_topic}"))
+        if by := debiased_by(stretch.metadata.get("imutool", {}), stretch.imu_topic):
+            logger.warning("%s: `%s` is debiased already, by %s: a model corrects it once more", stretch.name, RAW, by)
         aids = None
         if asked is not None:
             with Log(log) as opened:
@@ -91,6 +93,17 @@ def evaluate(
         chosen = recording.with_truth(next(iter(recording.truths))) if truth is None and recording.truths else recording
         results += _evaluated(chosen, debiased, log, models, init, smooth, aids, trajectories, overwrite, refused)
     return results
+
+
+def debiased_by(about: Mapping[str, str], topic: str) -> str:
+    """Name of the model that has debiased an IMU already; empty for a raw one.
+
+    `about` is the record `imutool` of its log.
+    """
+    from imutool.debiasing import DEBIASED_BY, SUFFIX
+
+    is_derived = topic == f"{about.get('source_topic')}{SUFFIX}"
+    return about.get(DEBIASED_BY) or (about.get("model", "") if is_derived else "")
 
 
 def _debiased(log: Path, stretches: Sequence[Recording], truth: str | None) -> Sequence[Imu | None]:

@@ -32,7 +32,9 @@ KINDS = ("density", "walk", "instability")  # of each sensor, as `Noise` has the
 SHORT = 2.5  # samples: over longer windows vibration averages out, and no longer bounds the residual from below
 DEPENDENT_TRUTH = 0.2  # of a sample's white noise: an independent truth differs by more
 EXPLAINED = 2.5  # times a sample's white noise: a larger residual comes from the truth or the calibration
+MOSTLY = 0.9  # of a log
 UNKNOWN: list[float | None] = [None] * 3
+FINE: Mapping[Sensor, list[bool]] = {sensor: [False] * 3 for sensor in SENSORS}
 WINDOWS_S: Mapping[Sensor, tuple[float, float]] = {"gyro": (1.0, 4.0), "accel": (0.5, 2.0)}  # of the calibration
 
 
@@ -44,11 +46,19 @@ class CurveSource:
     seconds: float
     curves: Mapping[Sensor, Curve]
     slopes: Mapping[Sensor, list[Slopes]]
+    at_most: Mapping[Sensor, list[float | None]]  # upper bound of each sensor's density
 
     @classmethod
-    def of(cls, how: str, seconds: float, curves: Mapping[Sensor, Curve]) -> CurveSource:
-        """Source with the slopes of its curves."""
-        return cls(how, seconds, curves, {sensor: allan.slopes(curve) for sensor, curve in curves.items()})
+    def of(
+        cls, how: str, seconds: float, curves: Mapping[Sensor, Curve], coarse: Mapping[Sensor, list[bool]] = FINE
+    ) -> CurveSource:
+        """Source with the slopes of its curves, but of axes with coarse digits."""
+        slopes, at_most = {}, {}
+        for sensor, curve in curves.items():
+            wrong = coarse[sensor]
+            slopes[sensor] = [Slopes() if wrong[axis] else found for axis, found in enumerate(allan.slopes(curve))]
+            at_most[sensor] = [None if wrong[axis] else bound for axis, bound in enumerate(allan.density_bound(curve))]
+        return cls(how, seconds, curves, slopes, at_most)
 
     def axes(self, sensor: Sensor, kind: str) -> list[float | None]:
         """Noise value of one kind, by axis."""
@@ -91,16 +101,13 @@ def identify(
     release_memory()
     rest = _at_rest(recording.imu, remarks)
     motion = None
-    if recording.truths:
-        try:
-            motion = _in_motion(recording, model, path)
-        except DataError as error:
-            remarks.append(f"in motion: {error.what}")
-    else:
-        remarks.append("in motion: the log has no true poses")
-    period_s = recording.imu.period_s
+    try:
+        motion = _in_motion(recording, model, path, 0.0 if rest is None else rest.seconds)
+    except DataError as error:
+        remarks.append(f"in motion: {error.what}")
+    period_s = allan.sample_period_s(recording.imu)
     samples = {sensor: CALM * white_noise(getattr(recording.imu, sensor)) * np.sqrt(period_s) for sensor in SENSORS}
-    at_most = {sensor: allan.density_bound(rest.curves[sensor]) if rest is not None else UNKNOWN for sensor in SENSORS}
+    at_most = dict.fromkeys(SENSORS, UNKNOWN) if rest is None else rest.at_most
     combined = _combine(rest, motion, samples, at_most, period_s, remarks)
     if rest is None and motion is None:
         raise DataError(
@@ -116,26 +123,30 @@ def _at_rest(imu: Imu, remarks: list[str]) -> CurveSource | None:
     if not (stretches := rest_stretches(imu)):
         remarks.append("at rest: the log never rests")
         return None
-    parts = [imu.rows(slice(*bounds)) for bounds in stretches]
-    total_s = sum(part.duration_s for part in parts)
-    curves = {sensor: allan.curve([getattr(part, sensor) for part in parts], imu.period_s) for sensor in SENSORS}
-    source = CurveSource.of(f"{_duration(total_s)} at rest", total_s, curves)
+    total_s, period_s = 1e-9 * sum(int(imu.t_ns[b - 1] - imu.t_ns[a]) for a, b in stretches), allan.sample_period_s(imu)
+    parts = {sensor: [getattr(imu, sensor)[slice(*bounds)] for bounds in stretches] for sensor in SENSORS}
+    curves = {sensor: allan.curve(parts[sensor], period_s) for sensor in SENSORS}
+    coarse = {sensor: allan.coarse_axes(parts[sensor]) for sensor in SENSORS}
+    source = CurveSource.of(f"{_duration(total_s)} at rest", total_s, curves, coarse)
     for sensor in SENSORS:
-        if remark := allan.vibration(sensor, source.slopes[sensor]):
-            remarks.append(f"at rest: {remark}")
+        remarks += [f"at rest: {text}" for text in allan.rest_remarks(sensor, source.slopes[sensor], coarse[sensor])]
         if all(walk is None for walk in source.axes(sensor, "walk")) and len(curves[sensor].tau_s):
             longest = float(curves[sensor].tau_s[-1])
             remarks.append(f"at rest: no bias walk of the {sensor} shows up to averages of {_duration(longest)}")
     return source
 
 
-def _in_motion(recording: Recording, model: str | Path | None, path: Location) -> CurveSource:
+def _in_motion(recording: Recording, model: str | Path | None, path: Location, rest_s: float) -> CurveSource:
     """Allan deviation of the residuals against the truth.
 
     Raises:
-        DataError: too little truth.
+        DataError: too little truth, or too little motion: a matrix fitted to rest explains the noise.
         ModelError: a model that does not fit this log.
     """
+    if not recording.truths:
+        raise DataError("the log has no true poses")
+    if rest_s > MOSTLY * recording.imu.duration_s:
+        raise DataError("the sensor rests nearly all the time")
     import imutool.training  # noqa: F401  refuses without PyTorch
     from imutool.noise.residual import curves
 

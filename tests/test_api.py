@@ -28,6 +28,7 @@ from support.loaded import loaded
 import imutool
 from imutool.cleaning.survey import raw_batches
 from imutool.cli.demo import write_asl
+from imutool.viewing.rerun.live import is_complete_rrd
 
 ROOT = Path(__file__).parents[1]
 IMPORT_SHARE = 0.1  # of the time that `import torch` takes
@@ -375,6 +376,18 @@ def test_a_debiased_recording_is_not_debiased_again(logs: Path, tmp_path: Path) 
     assert imutool.debias(raw, "static").model == "static"
 
 
+def test_a_channel_that_is_debiased_already_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    imutool.write(tmp_path / "raw.mcap", imutool.example_recording(duration_s=5.0))
+    imutool.debias(tmp_path / "raw.mcap", tmp_path / "out.mcap", model="static")
+    channel = imutool.read(tmp_path / "out.mcap", imu="/imu0/debiased")
+    with pytest.raises(imutool.DataError, match="debiased already, by static"):
+        imutool.debias(channel, "static")
+    imutool.evaluate(tmp_path / "out.mcap")
+    assert caplog.messages == []
+    imutool.evaluate(channel, models=["static"])
+    assert caplog.messages == ["flight_1: `raw` is debiased already, by static: a model corrects it once more"]
+
+
 def test_results_print_briefly(logs: Path) -> None:
     log, model = logs / "flight_2.mcap", imutool.load_model(logs / "linear.safetensors")
     still = imutool.read(log).imu.rows(slice(0, 400))
@@ -435,14 +448,15 @@ def test_the_covariance_of_live_samples_is_that_of_the_recording(logs: Path) -> 
         _ = plain.covariance
 
 
-def test_a_copy_of_a_live_debiaser_goes_its_own_way(logs: Path) -> None:
+@pytest.mark.parametrize("copied_by", [copy.copy, copy.deepcopy])
+def test_a_copy_of_a_live_debiaser_goes_its_own_way(copied_by: Callable[[Any], Any], logs: Path) -> None:
     imu, model = imutool.read(logs / "flight_2.mcap").imu, imutool.load_model(logs / "linear.safetensors")
     samples = list(zip(imu.t_ns.tolist(), imu.gyro, imu.accel, strict=True))[:800]
     alone, copied = imutool.OnlineDebiaser(model), imutool.OnlineDebiaser(model)
     for online in (alone, copied):
         for sample in samples[:400]:
             online(*sample)
-    branch = copy.deepcopy(copied)
+    branch = copied_by(copied)
     for stamp_ns, gyro, accel in samples[400:]:
         branch(stamp_ns, gyro + 0.3, accel)
     for sample in samples[400:]:
@@ -475,6 +489,17 @@ def test_a_view_leaves_the_environment_as_it_was(tmp_path: Path) -> None:
     code = f"import os, imutool\nbefore = dict(os.environ)\n{shown}\nprint(before == dict(os.environ))"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("True\n", "")
+
+
+def test_what_a_live_view_showed_until_ctrl_c_is_saved(tmp_path: Path) -> None:
+    def show(zeros: np.ndarray) -> None:
+        with imutool.watch("x", save=tmp_path / "x.rrd") as live:
+            live.add(STILL.imu, zeros, zeros + 1.0)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        show(np.zeros((len(STILL.imu), 6)))
+    assert is_complete_rrd(tmp_path / "x.rrd")
 
 
 def test_a_misspelt_option_of_view_is_named_before_any_work() -> None:

@@ -243,8 +243,8 @@ def _debias_recording(recording: Recording, model: object, init: str, smooth: bo
         )
     recording.imu.check_rate(recording.name)
     about = recording.metadata.get("imutool", {})
-    if DEBIASED_BY in about and not force:
-        what = f"its IMU is debiased already, by {about[DEBIASED_BY]}"
+    if (by := evaluation.debiased_by(about, recording.imu_topic)) and not force:
+        what = f"its IMU is debiased already, by {by}"
         raise DataError(what, where=recording.name, fix="Start from the raw recording, or set `force`")
     measured_imu(recording.imu, recording.name)  # warns of what is no measurement, and refuses a recording of nothing else
     first_ns = int(recording.imu.t_ns[0]) if len(recording.imu) else 0

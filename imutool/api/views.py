@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -248,7 +248,8 @@ def watch(
 ) -> Iterator[LiveView]:
     """Show a sensor while it measures: a context manager that gives a `LiveView`.
 
-    Without `connect` and `save` a viewer opens. Where no window can open, the view goes to the file `NAME.rrd`.
+    Without `connect` and `save` a viewer opens. Where no window can open, the view goes to the file `NAME.rrd`. An error or
+    Ctrl-C in the context ends the view as well; the file then holds what was shown until then.
 
     Args:
         name: Name of the recording in the viewer.
@@ -271,5 +272,9 @@ def watch(
     """
     file, instead = None if save is None else Path(save), Path(f"{name}.rrd")
     check_outputs([OutputFile("save", file, output_conflicts.RRD)], overwrite=overwrite)
-    with live.live_view(name, connect_to=connect, save=file, instead=instead, overwrite=overwrite) as show:
+    context = ExitStack()
+    show = context.enter_context(live.live_view(name, connect_to=connect, save=file, instead=instead, overwrite=overwrite))
+    try:
         yield LiveView(topic, show)
+    finally:
+        context.close()  # as at its usual end: what was shown is saved

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
 from functools import partial
 from operator import index
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -143,6 +144,10 @@ class OnlineDebiaser:
         """The model, and what was subtracted last."""
         last = f"last bias {np.array2string(self._bias, precision=5)}" if self._begun else "no sample yet"
         return f"<online debiaser of {self._model!r}: {last}>"
+
+    def __copy__(self) -> Self:
+        """Copy with a stream of its own."""
+        return deepcopy(self)
 
     def __call__(
         self,

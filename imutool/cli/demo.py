@@ -71,7 +71,7 @@ def run(
     """Run every step in the folder `out`, and report each.
 
     Raises:
-        ConfigError: the folder holds an earlier demo, or the extras view and report are not installed.
+        ConfigError: the folder holds an earlier demo, or the extras train, view and report are not installed.
     """
     _check(out, overwrite)  # before the packages of the work are loaded
     from imutool.conversion.run import convert
@@ -121,9 +121,9 @@ def made_up(seed: int) -> Recording:
 
 def _check(out: Path, overwrite: bool) -> None:
     """Check everything that would stop the demo half-way."""
-    for module, extra in (("rerun", "view"), ("matplotlib", "report")):
+    for module in ("torch", "rerun", "matplotlib"):
         if importlib.util.find_spec(module) is None:
-            raise not_installed(module, extra, where="demo")
+            raise not_installed(module, "train,view,report", where="demo")
     if out.exists() and not out.is_dir():
         raise ConfigError("is a file", where=out, expected="a folder")
     if out.exists() and any(out.iterdir()) and not overwrite:

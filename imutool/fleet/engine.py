@@ -224,7 +224,8 @@ class RayEngine:
             raise ConfigError(
                 f"Ray cannot be reached at {redact(address)} ({redact(why)})",
                 expected="a cluster that answers",
-                fix="Give the address of a cluster with `address`, or leave it out: then this machine does the work",
+                fix="Give the address of a cluster with `address`, or leave it out: then this machine does the work. "
+                "If the cluster asks for a token, as Ray 2.60 does, set RAY_AUTH_MODE=token",
             ) from error
 
 

@@ -62,8 +62,9 @@ def logs_of(folders: Sequence[Path]) -> list[FleetLog]:
         try:
             rows = pa.parquet.read_table(table).to_pylist()
         except (OSError, pa.ArrowInvalid) as error:
+            why = "no such file" if isinstance(error, FileNotFoundError) else str(error).partition(". Detail")[0]
             raise ConfigError(
-                f"cannot be read ({str(error).partition('. Detail')[0]})",
+                f"cannot be read ({why})",
                 where=table,
                 expected="the OUT of a fleet",
                 fix="Run `imutool fleet debias SRC OUT` first",

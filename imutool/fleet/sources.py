@@ -74,7 +74,9 @@ def find(text: str, out: Location, *, bags: bool = False, once: bool = False) ->
     real = cache(_real)
     logs, refused, taken, passed_over, outputs = [], [], dict[str, str](), Counter[str](), 0
     for where, about, unread in files:
-        if real(where.rpartition("/")[0]).startswith(real(str(out))):
+        linked = about is None and os.path.islink(where)  # noqa: PTH114  Path.is_symlink raises where it may not look
+        file = os.path.realpath(where) if linked else where
+        if real(file.rpartition("/")[0]).startswith(real(str(out))):
             outputs += _ends(where, endings)
             continue
         if not _ends(where, endings) and (ending := next((raw for raw in RAW if _ends(where, (raw,))), "")):

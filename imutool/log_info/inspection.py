@@ -216,7 +216,8 @@ def _noise(imu: ImuSamples, stretches: list[Interval]) -> ImuNoise:
     for axes in (slice(3), slice(3, 6)):
         calm = np.argsort(chosen_by[:, axes].sum(axis=1))[: max(1, round(CALM_SHARE * len(measured)))]
         std.append(np.sqrt(measured[calm, axes].mean(axis=0)))
-    gyro, accel, root_s = *std, np.sqrt(imu.period_s)
+    rate_hz = imu.sound.clock().rate_hz or 1.0 / imu.period_s  # a median of whole milliseconds errs
+    gyro, accel, root_s = *std, 1.0 / np.sqrt(rate_hz)
     return ImuNoise(gyro.tolist(), (gyro * root_s).tolist(), accel.tolist(), (accel * root_s).tolist())
 
 

@@ -23,6 +23,8 @@ import numpy as np
 
 from imutool.array_types import Bool, Float64
 from imutool.errors import required
+from imutool.inertial.stationary import GAP_PERIODS
+from imutool.recording.columns import Columns
 from imutool.units import Sensor
 
 LONGEST = 4  # averaging times up to the stretch over this: beyond, a single disagreement decides
@@ -34,6 +36,7 @@ CORRELATED = 1.7  # standard deviations of slopes beyond the white one: neighbou
 LEAST_FREEDOM = 10.0  # degrees of freedom that an averaging time needs to bound a density from above
 BOUND_RISK = 0.002  # probability that one averaging time puts the bound too low
 HUBER = 2.0
+COARSE = 0.55  # steps of the readings: as much as two neighbouring readings scatter, whatever the noise below them
 HALF = 0.5
 LEAST_TIMES = 3  # averaging times, an octave apart, that anything is fitted to
 LEAST_TIMES_OF = {"quantisation": 1, "density": 3, "instability": 3, "walk": 2, "ramp": 2}  # over which it must be the half
@@ -83,6 +86,25 @@ def library() -> ModuleType:
     """
     module: ModuleType = required("allantools", "noise", where="noise", user="an Allan deviation")
     return module
+
+
+def sample_period_s(rows: Columns) -> float:
+    """Mean step between rows, without gaps.
+
+    The median errs by up to a third where stamps are whole milliseconds.
+
+    Raises:
+        DataError: fewer than two rows.
+    """
+    longest_s, steps_s = GAP_PERIODS * rows.period_s, 1e-9 * np.diff(rows.t_ns)
+    return float(steps_s[steps_s <= longest_s].mean())
+
+
+def coarse_axes(stretches: Sequence[Samples]) -> list[bool]:
+    """Axes that hardly leave two neighbouring readings: they show digits, and no noise."""
+    variance = np.mean([part.var(axis=0) for part in stretches], axis=0)
+    steps = [np.diff(np.unique(column)).min(initial=np.inf) for column in np.concatenate(stretches).T]
+    return [bool(np.sqrt(v) < COARSE * step) for v, step in zip(variance, steps, strict=True)]
 
 
 def curve(stretches: Iterable[Samples], period_s: float) -> Curve:
@@ -241,15 +263,16 @@ def _is_seen(name: str, powers: dict[str, float], tau_s: Float64[np.ndarray, " m
 VIBRATES = 2.0  # times the white variance at shorter averaging times: more than any filter or misfit
 
 
-def vibration(sensor: Sensor, slopes: Sequence[Slopes]) -> str:
-    """Remark on a vibration at rest; empty where the deviation is the sensor's noise."""
-    vibrating = ["xyz"[axis] for axis, of_axis in enumerate(slopes) if _vibrates(of_axis)]
-    if not vibrating:
-        return ""
-    return (
+def rest_remarks(sensor: Sensor, slopes: Sequence[Slopes], coarse: Sequence[bool]) -> list[str]:
+    """Remarks on axes at rest that show a vibration, or nothing but their digits."""
+    vibrating = ["xyz"[axis] for axis, of_axis in enumerate(slopes) if _vibrates(of_axis) and not coarse[axis]]
+    digits = ["xyz"[axis] for axis, wrong in enumerate(coarse) if wrong]
+    shake = (
         f"the {sensor}'s deviation on {', '.join(vibrating)} does not fall as tau^-1/2 from the shortest on: "
         "something vibrates (idling motors?), so its noise is above the data sheet's"
     )
+    round_off = f"the {sensor} on {', '.join(digits)} hardly leaves one reading: its digits are too coarse to show its noise"
+    return [shake] * bool(vibrating) + [round_off] * bool(digits)
 
 
 def _vibrates(slopes: Slopes) -> bool:

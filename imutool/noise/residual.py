@@ -18,7 +18,7 @@ from imutool.geometry import so3
 from imutool.inertial.stationary import GAP_PERIODS
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
 from imutool.inertial.windows import rotation_residual, velocity_residual
-from imutool.noise.allan import Curve, freedom, library
+from imutool.noise.allan import Curve, freedom, library, sample_period_s
 from imutool.processes.system import release_memory
 from imutool.recording import Imu, Poses, seconds
 
@@ -48,8 +48,8 @@ def curves(imu: Imu, truth: Poses) -> tuple[Curve, Curve]:
     """
     poses, trusted = with_velocity(truth).at(imu.t_ns)
     t = seconds(imu.t_ns, int(imu.t_ns[0]))
-    period_s = imu.period_s
-    start = max(1, round(truth.period_s / period_s))  # shorter windows would lie between two poses
+    period_s = sample_period_s(imu)
+    start = max(1, round(sample_period_s(truth) / period_s))  # shorter windows would lie between two poses
     broken = np.cumsum((np.diff(t, prepend=t[0]) > GAP_PERIODS * period_s) | ~trusted)
     R_wb, v_w = so3.matrices_from_rows_wxyz(poses.q_wb_wxyz), poses.v_w
     assert v_w is not None

@@ -167,6 +167,14 @@ def give(path: Path, status: os.stat_result) -> None:
         os.chown(path, status.st_uid, status.st_gid)
 
 
+def read_at(file: IO[bytes], offset: int, length: int) -> bytes | None:
+    """Bytes of a file at an offset, at most `length`; None where the system cannot.
+
+    The place of the file stays: forked processes share it.
+    """
+    return os.pread(file.fileno(), length, offset) if hasattr(os, "pread") else None
+
+
 def copy_by_kernel(source: int, target: int, start: int, end: int) -> int:
     """Append bytes of one open file to another; return where the kernel stopped."""
     calls: tuple[Callable[[int], int], ...] = (

@@ -115,8 +115,11 @@ def plan(recording: Recording, settings: VioSettings) -> VioProblem:
     Where the truth has gaps it sees nothing.
 
     Raises:
-        DataError: no truth, or too little of it for two keyframes.
+        DataError: no truth, one without positions, or too little of it for two keyframes.
     """
+    if not recording.truth.has_positions:
+        what = "the true poses have no positions"
+        raise DataError(what, where=recording.name, expected="positions, along which the camera is simulated")
     imu = recording.imu
     truth = with_velocity(recording.truth)
     known = np.flatnonzero(truth.at(imu.t_ns)[1])

@@ -93,6 +93,15 @@ def test_an_earlier_demo_stays_without_overwrite(made: tuple[Path, dict[str, Any
     assert sorted(made[0].rglob("*")) == before
 
 
+def test_a_missing_package_is_named_before_any_work_with_all_that_the_demo_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda module: None if module == "torch" else module)
+    with pytest.raises(ConfigError, match=r"torch is not installed.*imutool\[train,view,report\]"):
+        demo.run(tmp_path / "demo-out", lambda _: None)
+    assert not (tmp_path / "demo-out").exists()
+
+
 def test_raw_files_of_a_flight_convert_back_to_the_same_bits(tmp_path: Path) -> None:
     from imutool.converters import euroc
 

@@ -76,6 +76,8 @@ def test_what_lies_in_out_is_no_source_whatever_link_leads_there(tmp_path: Path)
     (tmp_path / "link").symlink_to(tmp_path / "disk")
     assert names(tmp_path / "link", tmp_path / "disk" / "out") == ["a.mcap"]
     assert names(tmp_path / "disk", tmp_path / "link" / "out") == ["a.mcap"]
+    (tmp_path / "disk" / "to_out.mcap").symlink_to("out/a.mcap")  # another log's result would replace it
+    assert names(tmp_path / "disk", tmp_path / "disk" / "out") == ["a.mcap"]
 
 
 @pytest.mark.parametrize("out", [".", "logs"])

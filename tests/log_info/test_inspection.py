@@ -185,6 +185,12 @@ def test_rest_noise_and_gravity_of_a_resting_sensor(tmp_path):
     assert found["warnings"] == []
 
 
+def test_the_density_of_stamps_in_whole_milliseconds_is_that_of_their_mean_rate(tmp_path):
+    imu = resting(24_000)
+    (found,) = logged(tmp_path, replace(imu, t_ns=START_NS + 1_000_000 * np.ceil(5 / 3 * np.arange(24_000)).astype(int)))["imu"]
+    assert found["noise"]["gyro_density"] == pytest.approx([GYRO_STD * np.sqrt(1 / 600)] * 3, rel=NOISE_TOLERANCE)
+
+
 def test_the_noise_of_a_noisier_axis_is_not_that_of_its_calmest_seconds(tmp_path):
     imu = resting(24_000)
     (found,) = logged(tmp_path, replace(imu, gyro=imu.gyro[0] + (imu.gyro - imu.gyro[0]) * [1.0, 2.0, 4.0]))["imu"]

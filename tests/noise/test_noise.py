@@ -237,6 +237,28 @@ def test_noise_has_the_units_that_are_stated_whatever_those_of_the_samples(tmp_p
     assert not any("converted" in remark for remark in right.remarks)
 
 
+@pytest.mark.parametrize("rate_hz", [600.0, 700.0])
+def test_stamps_in_whole_milliseconds_do_not_change_the_density(rate_hz: float, tmp_path: Path) -> None:
+    gyro, accel = (noisy(seed, 30.0, rate_hz=rate_hz) for seed in (1, 2))
+    t_ns = START_NS + 1_000_000 * np.round(np.arange(len(gyro)) * 1e3 / rate_hz).astype(np.int64)
+    write(Recording("ms", Imu(t_ns, gyro, accel + np.array([0.0, 0.0, GRAVITY_M_S2]))), tmp_path / "ms.mcap")
+    found = identify(tmp_path / "ms.mcap")
+    assert found.noise.gyro_density == pytest.approx((DENSITY,) * 3, rel=DENSITY_TOLERANCE)
+    assert found.samples["gyro"] == pytest.approx((DENSITY,) * 3, rel=DENSITY_TOLERANCE)
+
+
+def test_digits_coarser_than_the_noise_show_no_noise(tmp_path: Path) -> None:
+    imu, lsb = still(60.0), 5.0 * DENSITY * np.sqrt(RATE_HZ)
+    write(Recording("coarse", Imu(imu.t_ns, np.round(imu.gyro / lsb) * lsb, imu.accel)), tmp_path / "coarse.mcap")
+    found = identify(tmp_path / "coarse.mcap")
+    assert found.noise.gyro_density == (None,) * 3
+    assert found.at_most["gyro"] == [None] * 3
+    assert [remark for remark in found.remarks if "digits" in remark or "vibrates" in remark] == [
+        "at rest: the gyro on x, y, z hardly leaves one reading: its digits are too coarse to show its noise"
+    ]
+    assert found.noise.accel_density == pytest.approx((2e-3,) * 3, rel=DENSITY_TOLERANCE)
+
+
 def test_a_shaken_sensor_is_said_to_vibrate(tmp_path: Path) -> None:
     imu = still(60.0)
     hum = 0.02 * np.sin(2.0 * np.pi * 13.7 * np.arange(len(imu)) / RATE_HZ)[:, None]
@@ -245,6 +267,16 @@ def test_a_shaken_sensor_is_said_to_vibrate(tmp_path: Path) -> None:
     said = [remark for remark in found.remarks if "vibrates" in remark]
     assert len(said) == 1
     assert "gyro's deviation on x, y, z" in said[0]
+
+
+def test_a_sensor_that_rests_all_the_time_has_no_noise_in_motion(tmp_path: Path) -> None:
+    imu = still(60.0)
+    truth = Poses(imu.t_ns, np.zeros((len(imu), 3)), np.tile([1.0, 0.0, 0.0, 0.0], (len(imu), 1)))
+    write(Recording("still", imu, truths={"/pose": truth}), tmp_path / "still.mcap")
+    found = identify(tmp_path / "still.mcap")
+    assert found.noise.accel_density == pytest.approx((2e-3,) * 3, rel=DENSITY_TOLERANCE)
+    assert found.in_motion is None  # a fitted matrix takes up noise: 36 % of the density were gone after 1000 s
+    assert "in motion: the sensor rests nearly all the time" in found.remarks
 
 
 def test_a_log_with_neither_rest_nor_truth_is_refused(tmp_path: Path) -> None:

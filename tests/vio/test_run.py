@@ -54,6 +54,13 @@ def test_too_little_truth_is_said(perfect: Recording) -> None:
         plan(perfect, VioSettings(duration_s=0.2))
 
 
+def test_orientations_alone_show_no_camera(perfect: Recording) -> None:
+    truth = perfect.truth
+    turns = Poses(truth.t_ns, np.zeros_like(truth.p_wb), truth.q_wb_wxyz)
+    with pytest.raises(DataError, match="have no positions"):
+        plan(replace(perfect, truths={"/pose": turns}), VioSettings())
+
+
 def test_poses_that_contradict_the_imu_give_no_figures(logs: Path, tmp_path: Path) -> None:
     """Of poses whose z is down it said 4.24 m raw and 4.26 m with a model, without a word."""
     made = read(sorted(logs.glob("*.mcap"))[0])

@@ -9,6 +9,7 @@ from types import TracebackType
 from imutool.errors import ConfigError, ImutoolError, LogError
 from imutool.file_location import Location, compression, io_errors, open_location, reason
 from imutool.mcap_io.codec.records import HEAD, crc32
+from imutool.processes.system import read_at
 
 BLOCK_BYTES = 1 << 20
 SHORT_BYTES, AHEAD_BYTES = 512, 1 << 13  # a read of at most so many bytes of a local file takes as many at once
@@ -17,7 +18,10 @@ OF_A_FOLDER = "Name a log in it; `imutool fleet` takes a folder of logs, and `im
 
 
 class Source:
-    """Bytes of a file or object, read only; a short read is an error."""
+    """Bytes of a file or object, read only; a short read is an error.
+
+    Threads and forked processes may share it.
+    """
 
     def __init__(self, path: Location, expected: str = "an MCAP log") -> None:
         try:
@@ -27,8 +31,8 @@ class Source:
         except io_errors(path) as error:
             raise ConfigError(f"cannot be opened ({reason(error)})", where=path, expected=expected) from error
         self.path = path
-        self._ahead, self._ahead_at = b"", 0  # bytes read ahead of short reads, and where they lie
-        self._is_local = descriptor(self.file) is not None
+        self._ahead = 0, b""  # where the bytes lie that were read ahead of short reads, and these
+        self._is_local, self._moves = descriptor(self.file) is not None, threading.Lock()
         if self._is_local and (program := compression(self._read(0, 8))):
             self.file.close()
             what, fix = (
@@ -44,12 +48,13 @@ class Source:
             LogError: the file does not have them, or the disk or the store does not give them.
         """
         if length <= SHORT_BYTES and self._is_local:
-            start = offset - self._ahead_at
-            if not 0 <= start <= len(self._ahead) - length:
-                start, self._ahead_at = 0, offset
-                self._ahead = self._read(offset, min(AHEAD_BYTES, max(length, self.size - offset)))
-            if length <= len(self._ahead) - start:
-                return self._ahead[start : start + length]
+            ahead_at, ahead = self._ahead
+            start = offset - ahead_at
+            if not 0 <= start <= len(ahead) - length:
+                start, ahead = 0, self._read(offset, min(AHEAD_BYTES, max(length, self.size - offset)))
+                self._ahead = offset, ahead
+            if length <= len(ahead) - start:
+                return ahead[start : start + length]
         parts = self._read(offset, length)
         if len(parts) != length:
             raise LogError(f"the log is cut short at byte {offset + len(parts)}", fix=CUT_SHORT)
@@ -58,13 +63,20 @@ class Source:
     def _read(self, offset: int, length: int) -> bytes:
         """These bytes, or those up to the end of the file."""
         try:
-            self.file.seek(offset)
-            parts = self.file.read(length)
-            while len(parts) < length and (part := self.file.read(length - len(parts))):
+            parts = self._part(offset, length)
+            while len(parts) < length and (part := self._part(offset + len(parts), length - len(parts))):
                 parts += part
         except io_errors(self.path) as error:
             raise LogError(f"cannot be read at byte {offset} ({reason(error)})") from error
         return parts
+
+    def _part(self, offset: int, length: int) -> bytes:
+        """Some of these bytes at least."""
+        if self._is_local and (part := read_at(self.file, offset, length)) is not None:
+            return part
+        with self._moves:
+            self.file.seek(offset)
+            return self.file.read(length)
 
     def head(self, offset: int) -> tuple[int, int]:
         """Opcode and length of the record at an offset."""

@@ -12,7 +12,6 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.inertial import stationary
 from imutool.noise import allan
-from imutool.noise.allan import Curve
 from imutool.recording import Imu
 from imutool.units import AXES, SENSORS, UNITS, Sensor
 from imutool.viewing.html.drawing import Panel, Picture, at_least_three_ticks, decades, legend, plain_tick_labels
@@ -110,18 +109,20 @@ def allan_deviation(data: RunData) -> Picture | None:
         return None
     data = data.integrated()
     imu = data.traces[0].run.imu
-    ranges = [(a, b) for a, b in stationary.rest_stretches(imu) if (b - a) * imu.period_s >= MIN_REST_S]
+    ranges = [(a, b) for a, b in stationary.rest_stretches(imu) if (imu.t_ns[b - 1] - imu.t_ns[a]) * 1e-9 >= MIN_REST_S]
     if not ranges:
         return None
-    rest_s = sum(b - a for a, b in ranges) * imu.period_s
+    period_s = allan.sample_period_s(imu)
+    rest_s = sum(b - a for a, b in ranges) * period_s
     curves: dict[str, list[Any]] = {sensor: [] for sensor in SENSORS}
-    recorded: dict[Sensor, Curve] = {}
+    remarks: dict[Sensor, list[str]] = {}  # on what was recorded, the first trace
     for trace in data.traces:
-        still = [trace.run.imu.between(int(imu.t_ns[a]), int(imu.t_ns[b - 1])) for a, b in ranges]
         for sensor in SENSORS:
-            curve = allan.curve([getattr(part, sensor) for part in still], imu.period_s)
+            still = [getattr(trace.run.imu, sensor)[a:b] for a, b in ranges]
+            curve = allan.curve(still, period_s)
             curves[sensor].append((trace, curve.tau_s, curve.deviation))
-            recorded.setdefault(sensor, curve)
+            if sensor not in remarks:
+                remarks[sensor] = allan.rest_remarks(sensor, allan.slopes(curve), allan.coarse_axes(still))
     panels = [
         Panel(
             partial(_draw_allan, data=data, sensor=sensor, curves=curves[sensor]),
@@ -131,8 +132,7 @@ def allan_deviation(data: RunData) -> Picture | None:
         for sensor in SENSORS
     ]
     caption = f"Over {format_number(rest_s)} s at rest in {len(ranges)} stretch{'es' * (len(ranges) > 1)}; overlapping."
-    remarks = [allan.vibration(sensor, allan.slopes(first)) for sensor, first in recorded.items()]
-    caption = " ".join([caption, *(f"{remark[0].upper()}{remark[1:]}." for remark in remarks if remark)])
+    caption = " ".join([caption, *(f"{remark[0].upper()}{remark[1:]}." for sensor in SENSORS for remark in remarks[sensor])])
     return Picture("allan", "Allan deviation at rest", caption, tuple(panels))
 
 
