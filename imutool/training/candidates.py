@@ -26,7 +26,7 @@ from imutool.training.calibration.effect_selection import (
     parameter_columns,
 )
 from imutool.training.calibration.log_scatter import LEAST_GAIN
-from imutool.training.calibration.normal_equations import gain_of
+from imutool.training.calibration.shared_parameters import gain_of
 from imutool.training.log_signals import effects_turned_alike
 from imutool.training.settings import TrainSettings
 from imutool.training.training_windows import Pool, without_motion

@@ -39,7 +39,8 @@ from imutool.sensor.samples import SensorSamples
 from imutool.sensor.signals import LOAD, LOAD_TAU_S, LOADS, Load, SignalFilter, Signals
 from imutool.training.calibration.closed_form import Solution
 from imutool.training.calibration.log_scatter import CLOCK, LEVER, ROTATION, Integrated, integrated, minus_log_likelihood
-from imutool.training.calibration.normal_equations import Problem, Seen, Terms, linearise
+from imutool.training.calibration.normal_equations import Seen, Terms, linearise
+from imutool.training.calibration.shared_parameters import Problem
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Pool
 from imutool.units import AXES, Sensor

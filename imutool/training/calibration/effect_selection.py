@@ -33,7 +33,8 @@ from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import Load, Signals
 from imutool.training.calibration.log_scatter import LEAST_GAIN, widest
-from imutool.training.calibration.normal_equations import Problem, Seen, Terms, gain_of, linearise
+from imutool.training.calibration.normal_equations import Seen, Terms, linearise
+from imutool.training.calibration.shared_parameters import Problem, gain_of
 from imutool.training.fit import Epoch, note
 from imutool.training.log_signals import effects_turned_alike, loaded_signals, signals_of
 from imutool.training.settings import SensorPrior, TrainSettings

@@ -20,7 +20,8 @@ from imutool.array_types import Float
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.training.calibration.closed_form import W_PRIOR
 from imutool.training.calibration.log_scatter import LEAST_GAIN, SURELY
-from imutool.training.calibration.normal_equations import TINY, Seen, Terms, linearise
+from imutool.training.calibration.normal_equations import Seen, Terms, linearise
+from imutool.training.calibration.shared_parameters import TINY
 from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 

@@ -2,8 +2,7 @@
 
 Unknowns are theta, the effect parameters that all logs share, and a few of each log: its rest bias and its nuisances
 (`imutool.training.calibration.log_scatter`: rotation, clock and lever arm between poses and sensor, tilt of the poses'
-world). An effect of the same form as a nuisance is what logs have in common. Those of a log are eliminated log by log (Schur's
-complement), so that one solve of a matrix as small as theta predicts a log from all others. Errors are linear in the
+world). An effect of the same form as a nuisance is what logs have in common. Errors are linear in the
 parameters: with a window's residual and Jacobian (sums of pieces, `imutool.inertial.windows`), the rest is a product of
 matrices.
 """
@@ -11,7 +10,6 @@ matrices.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,14 +24,8 @@ from imutool.inertial.windows import HUBER_MEDIANS, Pieces, Prefix, derivative_b
 from imutool.sensor.linear_form import LinearForm, patterns, terms_of
 from imutool.sensor.signals import Signals
 from imutool.training.calibration.closed_form import end_samples, median_per_log, nuisance_jacobian, window_sets
-from imutool.training.calibration.log_scatter import (
-    LogPieces,
-    integrated,
-    shared_by_scatter,
-    shown_by_logs,
-    sums_by_log,
-    widest,
-)
+from imutool.training.calibration.log_scatter import LogPieces, shown_by_logs, sums_by_log, widest
+from imutool.training.calibration.shared_parameters import Equations, Problem
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Part, Pool
 from imutool.units import Sensor
@@ -46,122 +38,6 @@ REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of m
 SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
 SETTLED, MOST_STEPS = 0.2, 40  # deviations by which a step moves a parameter at most; steps with windows of all lengths
 WEAK = 0.01  # of a prior's precision, that of the prior at first
-TINY = 1e-12  # of a loss, whose unit is a window's noise
-RIDGE = 1e-9  # of a diagonal, so that a log without information on its own unknowns can be solved
-
-
-@dataclass(frozen=True)
-class Equations:
-    """Loss of each log about a point, c + 2 g.d + d.H.d: unknowns theta, then the log's own."""
-
-    H: Float[Tensor, "logs k k"]
-    g: Float[Tensor, "logs k"]
-    c: Float[Tensor, " logs"]
-
-    def __add__(self, other: Equations) -> Equations:
-        return Equations(self.H + other.H, self.g + other.g, self.c + other.c)
-
-    def times(self, factor: float) -> Equations:
-        """The same losses, each multiplied by a factor."""
-        return Equations(factor * self.H, factor * self.g, factor * self.c)
-
-    def moved(self, d_theta: Float[Tensor, " p"]) -> Equations:
-        """The same losses about another point, moved in theta."""
-        p = len(d_theta)
-        Hd = self.H[:, :, :p] @ d_theta
-        return Equations(self.H, self.g + Hd, self.c + 2 * self.g[:, :p] @ d_theta + Hd[:, :p] @ d_theta)
-
-
-class Solution(NamedTuple):
-    """Parameters, zero where they were not solved for, and the covariance of the others."""
-
-    theta: Float[Tensor, " p"]
-    covariance: Float[Tensor, "c c"]
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Linearisation point, the losses about it, and priors about zero."""
-
-    theta: Float[Tensor, " p"]
-    own: Float[Tensor, "logs o"]
-    prior: Float[Tensor, " p"]  # one over the plausible variance of each parameter
-    own_prior: Float[Tensor, " o"]
-    design_effect: float  # by which the losses are divided
-    free: int  # of a log's own unknowns: those without a prior when the log is predicted
-    fit: Equations
-    judged: Equations  # what a solution is judged by
-
-    def solve(self, columns: Sequence[int], without: int | None = None) -> Solution:
-        """Gauss-Newton step for some parameters, the others at zero, and all logs but one."""
-        columns, p = list(columns), len(self.prior)
-        at = torch.zeros_like(self.theta)
-        at[columns] = self.theta[columns]
-        fit = self.fit.moved(at - self.theta)
-        own_H, own_g = self._own_equations(fit)
-        shared = fit.H[:, columns]
-        X = torch.linalg.solve(own_H, shared[:, :, p:].mT)
-        S, v = shared[:, :, columns] - shared[:, :, p:] @ X, fit.g[:, columns] - (X.mT @ own_g[..., None])[..., 0]
-        kept = [i for i in range(len(self.own)) if i != without]
-        S, v = torch.diag(self.prior[columns]) + S[kept].sum(0), self.prior[columns] * at[columns] + v[kept].sum(0)
-        covariance = torch.linalg.inv(S) if columns else S
-        at[columns] -= covariance @ v
-        return Solution(at, covariance)
-
-    def solve_by_scatter(self, columns: Sequence[int], without: int | None = None) -> Solution:
-        """The same with errors as large as the logs scatter, in place of the design effect."""
-        columns, logs = list(columns), [i for i in range(len(self.own)) if i != without]
-        at = torch.zeros_like(self.theta)
-        at[columns] = self.theta[columns]
-        fit = self._of(logs, self.design_effect).fit.moved(at - self.theta)
-        kept = [*columns, *range(len(self.prior), fit.g.shape[1])]
-        of_logs = integrated(fit.H[:, kept][:, :, kept], fit.g[:, kept], self.own[logs], self.own_prior, len(columns))
-        at[columns], covariance = shared_by_scatter(of_logs, at[columns], self.prior[columns])
-        return Solution(at, covariance)
-
-    def without(self, index: int) -> Problem:
-        """The problem of all logs but one."""
-        return self._of([i for i in range(len(self.own)) if i != index])
-
-    def alone(self, index: int) -> Problem:
-        """The problem of one log, which counts in full."""
-        return replace(self._of([index], self.design_effect), design_effect=1.0)
-
-    def own_at(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "logs o"]:
-        """Unknowns of each log, for given parameters."""
-        H, g = self._own_equations(self.fit.moved(theta - self.theta))
-        own: Tensor = self.own - torch.linalg.solve(H, g)
-        return own
-
-    def predicted(self, columns: Sequence[int], *, by_itself: bool = False, by_scatter: bool = False) -> Float[Tensor, " logs"]:
-        """Loss of each log with parameters of the other logs, or `by_itself`; its own are solved for."""
-        of_others = self.solve_by_scatter if by_scatter else self.solve
-        p, losses = len(self.prior), []
-        held = torch.where(torch.arange(len(self.own_prior)).to(self.prior) < self.free, 0.0, self.own_prior)
-        for i, at in enumerate(self.own):
-            theta = self.alone(i).solve(columns).theta if by_itself else of_others(columns, without=i).theta
-            judged = self.judged.moved(theta - self.theta)
-            H, g = judged.H[i, p:, p:] + torch.diag(held), judged.g[i, p:] + held * at
-            least = RIDGE * H.diagonal().mean().clamp_min(RIDGE)
-            own = -torch.linalg.solve(H + least * torch.eye(len(g)).to(H), g)
-            losses.append(judged.c[i] + held @ at.square() + 2 * g @ own + own @ H @ own)
-        return torch.stack(losses)
-
-    def _of(self, logs: Sequence[int], factor: float = 1.0) -> Problem:
-        fit, judged = (Equations(e.H[logs], e.g[logs], e.c[logs]).times(factor) for e in (self.fit, self.judged))
-        return replace(self, own=self.own[logs], fit=fit, judged=judged)
-
-    def _own_equations(self, fit: Equations) -> tuple[Float[Tensor, "logs o o"], Float[Tensor, "logs o"]]:
-        p = len(self.prior)
-        return fit.H[:, p:, p:] + torch.diag(self.own_prior), fit.g[:, p:] + self.own_prior * self.own
-
-
-def gain_of(new: Float[Tensor, " logs"], loss: Float[Tensor, " logs"]) -> float:
-    """Share of the losses of logs that new ones take off, by a geometric mean.
-
-    A log that nothing explains does not outvote the others.
-    """
-    return 1 - float((new.clamp_min(TINY) / loss.clamp_min(TINY)).log().mean().exp())
 
 
 def design_effect(pool: Pool) -> float:

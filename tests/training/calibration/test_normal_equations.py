@@ -12,7 +12,7 @@ from imutool.sensor.made_up_flight import flight
 from imutool.training.calibration import log_scatter
 from imutool.training.calibration.effect_selection import calibrate
 from imutool.training.calibration.log_scatter import USUAL_SQUARES, WANDER, LogPieces
-from imutool.training.calibration.normal_equations import Equations, Problem
+from imutool.training.calibration.shared_parameters import Equations, Problem
 from imutool.training.training_windows import Pool
 
 LOGS, SHARED, OWN, DRAWS = 4, 5, 2, 200
