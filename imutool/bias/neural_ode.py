@@ -8,8 +8,8 @@ time scales differ by four orders of magnitude::
 
 *C*, the curve, is the part that the motion adds: scale, misalignment, curvature. Its term generalizes the paper's term for a
 linear sensor, (I - A^{-1}) du/dt (after eq. 31), to any smooth sensor. As a total derivative it integrates to C exactly, with
-every solver and step. Its hidden layers are drawn: of many units those stay in which the others are nearly linear at the
-samples, so that another draw hardly changes the model. What follows them is least squares
+every solver and step. Its hidden layers are drawn: of many units those stay from which a linear map nearly gives the others
+at the samples, so that another draw hardly changes the model. What follows them is least squares
 (`imutool.training.calibration.last_layer`). C also depends on the samples filtered over 0.1 s (ds/dt = (u - s) / tau, solved
 exactly), for sensors whose error lags their motion. *g*, the drift, moves the rest bias beta = b - C, the turn-on bias of a
 run; its scale makes it slow. It is a residual perceptron of the paper's size, integrated along the samples filtered over half a

@@ -52,7 +52,7 @@ class Curve(nn.Module):
 
     @torch.no_grad()
     def keep_spanning(self, u: Float[Tensor, "n 3"], slow: Float[Tensor, "n 3"]) -> None:
-        """Draw wide hidden layers, and keep the units in which all others are nearly linear at some samples.
+        """Draw wide hidden layers, and keep the units from which a linear map nearly gives all others at some samples.
 
         So the curve hardly depends on the draw, and its prior is that of all units.
 
@@ -131,7 +131,7 @@ class Network(BiasNetwork):
         self.drift = nn.ModuleDict({sensor: drift for sensor, drift in drifts.items() if sensor in chosen.drifting})
 
     def see(self, gyro: Float[Tensor, "n 3"], accel: Float[Tensor, "n 3"]) -> None:
-        """Choose the units of N, and compute it in float32 from now on, in two fifths of the time; all else stays float64."""
+        """Choose the units of N, and compute it in float32 from now on, which takes two fifths of the time."""
         for sensor, u in zip(self.curve, (gyro, accel), strict=not self.config.paper):
             curve = _part(self.curve, sensor, Curve)
             curve.keep_spanning(u, self._filtered(u[None], SLOW_S)[0])
@@ -236,7 +236,7 @@ def _spanning(
 ) -> tuple[Int[Tensor, " number"], Float[Tensor, "number m"]]:
     """Columns of `units` that span them, by pivots, and the coefficients with which they come nearest to `wanted`.
 
-    With scipy, because PyTorch's least squares round otherwise from call to call.
+    PyTorch's least squares have other last digits from call to call, scipy's factors do not.
     """
     from scipy.linalg import qr, solve_triangular  # a network that is only drawn needs no scipy
 

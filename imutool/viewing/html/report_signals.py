@@ -117,8 +117,9 @@ def allan_deviation(data: RunData) -> Picture | None:
     curves: dict[str, list[Any]] = {sensor: [] for sensor in SENSORS}
     remarks: dict[Sensor, list[str]] = {}  # on what was recorded, the first trace
     for trace in data.traces:
+        at_rest = [trace.run.imu.between(int(imu.t_ns[a]), int(imu.t_ns[b - 1])) for a, b in ranges]
         for sensor in SENSORS:
-            still = [getattr(trace.run.imu, sensor)[a:b] for a, b in ranges]
+            still = [getattr(part, sensor) for part in at_rest]
             curve = allan.curve(still, period_s)
             curves[sensor].append((trace, curve.tau_s, curve.deviation))
             if sensor not in remarks:

@@ -466,6 +466,16 @@ def test_a_bare_log_has_no_empty_section(flown: Recording) -> None:
     assert report_signals.allan_deviation(build(replace(flown, imu=moving), [Run.raw(moving)])) is None
 
 
+def test_a_run_that_begins_later_is_at_rest_at_the_same_times(flown: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    late: Imu = flown.imu.rows(slice(200, None))
+    data = build(replace(flown, truths={}, scalars={}), [Run.raw(flown.imu), replace(Run.raw(late), name="late")])
+    curve, stretches = report_signals.allan.curve, []
+    monkeypatch.setattr(report_signals.allan, "curve", lambda parts, step_s: stretches.append(parts) or curve(parts, step_s))
+    assert report_signals.allan_deviation(data) is not None
+    of_raw, _, of_late, _ = stretches
+    np.testing.assert_array_equal(of_late[0], of_raw[0][200:])
+
+
 @pytest.mark.usefixtures("words_alone")
 def test_truth_without_a_model_is_scored_alone(seen: RunData) -> None:
     with drawing_only(report_signals.biases, report_signals.zoom):
