@@ -17,6 +17,7 @@ from imutool.sensor.signals import TEMPERATURE_TERMS
 
 MOST_AGE_S = 60.0  # of a number of the channel: a case warms within minutes
 SET_BACK = 2  # half seconds: further back the clock was set, and the sample is not late
+WALK_NS = 10_000_000_000  # between two numbers of a drift, from which its walk is taken
 MOST_BEYOND_K = 1.0  # beyond the trained range, before it counts as another one
 Rows3 = Float64[np.ndarray, "n 3"]
 Rows6 = Float64[np.ndarray, "n 6"]
@@ -41,6 +42,13 @@ class TemperatureDrift:
     def __call__(self, t_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
         """Drift at some stamps: gyro (rad/s), then accel (m/s²)."""
         return np.asarray(self._bias[holding(self._t_ns, t_ns)])
+
+    def missed(self, start_ns: int, end_ns: int) -> tuple[Vector6, Vector6]:
+        """Size of the drift beyond the trained range in a log, and its walk in a second^1/2."""
+        rows = holding(self._t_ns, np.arange(start_ns, end_ns + 1, WALK_NS))
+        missed = self._clamped[rows]
+        walk = np.sqrt((np.diff(missed, axis=0) ** 2).mean(axis=0) * (1e9 / WALK_NS)) if len(rows) > 1 else np.zeros(6)
+        return np.sqrt((missed**2).mean(axis=0)), walk
 
     def covariance(self, t_ns: Int64[np.ndarray, " n"]) -> Covariances:
         """Covariance of the drift relative to its mean so far.
@@ -104,11 +112,12 @@ def bound(model: BiasModel, scalars: Mapping[str, Scalars], imu_topic: str, star
         several = [name for name in scalars if is_temperature(name)]
         what = f"none of {', '.join(several)} is named as the IMU's temperature" if several else "there is no temperature"
         out.remarks = (f"{what}; the model's bias follows it ({trained}), and varies unseen",)
-        return _widened(out)
+        return _widened(out, *(model.tensors[f"temperature.{name}"] for name in ("spread", "walk")))
     name, channel = found
-    out.log_drift = TemperatureDrift(model, channel, name)
+    out.log_drift = drift = TemperatureDrift(model, channel, name)
     out.remarks = tuple(_remarks(channel, name, start_ns, end_ns, low, high))
-    return out
+    spread, walk = drift.missed(start_ns, end_ns)
+    return _widened(out, spread, walk) if spread.any() else out
 
 
 def started_at(model: BiasModel, numbers: Sequence[tuple[int, float]], start_ns: int, end_ns: int) -> BiasModel:
@@ -133,9 +142,8 @@ def _remarks(channel: Scalars, name: str, start_ns: int, end_ns: int, low: float
     return out
 
 
-def _widened(model: BiasModel) -> BiasModel:
-    """Model whose rest bias varies as the drift did in training; a copy."""
-    spread, walk = (model.tensors[f"temperature.{name}"] for name in ("spread", "walk"))
+def _widened(model: BiasModel, spread: Vector6, walk: Vector6) -> BiasModel:
+    """Model whose rest bias varies as a drift that is not subtracted; changes the model."""
 
     def wider(std: Vector6) -> Vector6:
         return np.sqrt(np.asarray(std) ** 2 + spread**2)
