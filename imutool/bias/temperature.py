@@ -2,7 +2,8 @@
 
 x holds Legendre polynomials P of the temperature up to the third order, at once and behind lags, for the die lags what
 measures the case: dz/dt = (P(s) - z) / tau, s = (T - centre) / half range of training. Polynomials of the third order are what
-PX4 calibrates gyro and accelerometer with (PX4 user guide, thermal calibration); as there, s is clamped to the trained range.
+PX4 calibrates gyro and accelerometer with (PX4 user guide, thermal calibration). There s is clamped to the trained range; here
+P goes on straight beyond it.
 Relative to the mean of training the drift is no part of the prior of the rest bias, and zero is the best guess without a
 temperature.
 
@@ -31,6 +32,7 @@ from imutool.units import AXES, SENSORS, Sensor
 
 ORDERS = 3
 ZERO_CELSIUS_K = 273.15
+MOST_BEYOND = 5.0  # half ranges, beyond the trained one, for which the bias goes on: a channel may have a wrong number
 LEAST_KELVIN = 200.0  # no sensor works at as many °C, none at fewer kelvin
 PLAUSIBLE: Mapping[Sensor, tuple[str, float]] = {"gyro": ("rad/s", 0.01), "accel": ("m/s²", 0.1)}
 Terms = Float64[np.ndarray, "n 12"]
@@ -105,8 +107,9 @@ class TemperatureFilter:
 
     def __call__(self, t_ns: int, celsius: float) -> Float64[np.ndarray, "12"]:
         """Terms from this number on."""
-        s = min(1.0, max(-1.0, (celsius - self._centre) / self._half_range))
-        now = np.array([s, 1.5 * s**2 - 0.5, 2.5 * s**3 - 1.5 * s])
+        at = (celsius - self._centre) / self._half_range
+        s = min(1.0, max(-1.0, at))
+        now = np.array([s, 1.5 * s**2 - 0.5, 2.5 * s**3 - 1.5 * s]) + _straight_on(at)[0]
         if self._z is None:
             self._z = np.tile(now, (1 + len(LOAD_TAU_S), 1))
         else:
@@ -115,6 +118,12 @@ class TemperatureFilter:
             self._z[0] = now
         self._t_ns = t_ns
         return self._z.ravel().copy()
+
+
+def _straight_on(s: Float64[np.ndarray, " n"] | float) -> Float64[np.ndarray, "n 3"]:
+    """What Legendre polynomials gain beyond -1 to 1 by their slope at the end."""
+    beyond = np.reshape(s - np.clip(s, -1.0, 1.0), (-1, 1)).clip(-MOST_BEYOND, MOST_BEYOND)
+    return np.asarray(beyond * [1.0, 3.0, 6.0] * np.sign(beyond) ** [0, 1, 2])
 
 
 class Scale(NamedTuple):
@@ -132,10 +141,8 @@ class Scale(NamedTuple):
         return np.asarray(np.array(rows).reshape(-1, TEMPERATURE_TERMS) - self.mean)
 
     def beyond(self, channel: Scalars) -> Terms:
-        """What the terms would gain beyond the range, by their slope at its end once all lags are over."""
-        s = (channel.values - self.centre) / self.half_range
-        slope = np.concatenate([np.sign(s), 3.0 * np.ones_like(s), 6.0 * np.sign(s)], axis=1)
-        return np.asarray(np.tile(np.maximum(np.abs(s) - 1.0, 0.0) * slope, 1 + len(LOAD_TAU_S)))
+        """What the terms gain beyond the range, once all lags are over."""
+        return np.tile(_straight_on((channel.values[:, 0] - self.centre) / self.half_range), 1 + len(LOAD_TAU_S))
 
 
 def holding(channel_ns: Int64[np.ndarray, " m"], t_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:

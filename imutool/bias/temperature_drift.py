@@ -30,43 +30,42 @@ class TemperatureDrift:
     def __init__(self, model: BiasModel, channel: Scalars, name: str) -> None:
         self.name, self._t_ns = name, channel.t_ns
         scale = scale_of(model)
-        self._terms = scale.terms(channel)
+        terms, beyond = scale.terms(channel), scale.beyond(channel)
+        self._within = terms - beyond
         self._by_sensor = model.temperature_parameters()
-        self._bias, self._clamped = np.zeros((2, len(self._terms), 6))
-        slopes = scale.beyond(channel)
+        self._bias, self._beyond = np.zeros((2, len(terms), 6))
         for sensor, (theta, _) in self._by_sensor.items():
             K = theta.reshape(3, TEMPERATURE_TERMS).T
-            self._bias[:, COLUMNS[sensor]] = self._terms @ K
-            self._clamped[:, COLUMNS[sensor]] = slopes @ K
+            self._bias[:, COLUMNS[sensor]] = terms @ K
+            self._beyond[:, COLUMNS[sensor]] = beyond @ K
 
     def __call__(self, t_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
         """Drift at some stamps: gyro (rad/s), then accel (m/s²)."""
         return np.asarray(self._bias[holding(self._t_ns, t_ns)])
 
-    def missed(self, start_ns: int, end_ns: int) -> tuple[Vector6, Vector6]:
+    def beyond(self, start_ns: int, end_ns: int) -> tuple[Vector6, Vector6]:
         """Size of the drift beyond the trained range in a log, and its walk in a second^1/2."""
         rows = holding(self._t_ns, np.arange(start_ns, end_ns + 1, WALK_NS))
-        missed = self._clamped[rows]
-        walk = np.sqrt((np.diff(missed, axis=0) ** 2).mean(axis=0) * (1e9 / WALK_NS)) if len(rows) > 1 else np.zeros(6)
-        return np.sqrt((missed**2).mean(axis=0)), walk
+        drift = self._beyond[rows]
+        walk = np.sqrt((np.diff(drift, axis=0) ** 2).mean(axis=0) * (1e9 / WALK_NS)) if len(rows) > 1 else np.zeros(6)
+        return np.sqrt((drift**2).mean(axis=0)), walk
 
     def covariance(self, t_ns: Int64[np.ndarray, " n"]) -> Covariances:
         """Covariance of the drift relative to its mean so far.
 
-        The mean acts like a rest bias, and counts in its covariance (`imutool.bias_start.bias_covariance`). Beyond the trained
-        range the drift is as unsure as it would change if it went on with its slope at the end of the range.
+        The mean acts like a rest bias, and counts in its covariance (`imutool.bias_start.bias_covariance`), as does what the
+        drift has beyond the trained range (`bound`).
         """
         out, rows = np.zeros((len(t_ns), 6, 6)), holding(self._t_ns, t_ns)
         if not len(rows):
             return out
         row, place = np.unique(rows, return_inverse=True)
-        means = np.cumsum(self._terms[: row[-1] + 1], axis=0)[row] / (row + 1.0)[:, None]
-        off = self._terms[row] - means
+        means = np.cumsum(self._within[: row[-1] + 1], axis=0)[row] / (row + 1.0)[:, None]
+        off = self._within[row] - means
         for sensor, (_, covariance) in self._by_sensor.items():
             blocks = covariance.reshape(3, TEMPERATURE_TERMS, 3, TEMPERATURE_TERMS)
             S = np.einsum("nq,iqjr,nr->nij", off, blocks, off, optimize=True)
             out[:, COLUMNS[sensor], COLUMNS[sensor]] = S[place]
-        out[:, range(6), range(6)] += self._clamped[rows] ** 2
         return out
 
 
@@ -99,8 +98,8 @@ class OnlineDrift:
 def bound(model: BiasModel, scalars: Mapping[str, Scalars], imu_topic: str, start_ns: int, end_ns: int) -> BiasModel:
     """Model with its drift in one log; the model itself where it follows no temperature.
 
-    Without a channel there is no drift, and the rest bias varies as much as the drift did in training. `remarks` say so, and
-    what else makes the drift less sure.
+    Without a channel there is no drift, and the rest bias varies as much as the drift did in training. Beyond the trained range
+    it varies as much as the drift does there. `remarks` say so, and what else makes the drift less sure.
     """
     if not model.temperature_parameters():
         return model
@@ -116,7 +115,7 @@ def bound(model: BiasModel, scalars: Mapping[str, Scalars], imu_topic: str, star
     name, channel = found
     out.log_drift = drift = TemperatureDrift(model, channel, name)
     out.remarks = tuple(_remarks(channel, name, start_ns, end_ns, low, high))
-    spread, walk = drift.missed(start_ns, end_ns)
+    spread, walk = drift.beyond(start_ns, end_ns)
     return _widened(out, spread, walk) if spread.any() else out
 
 
@@ -132,9 +131,8 @@ def _remarks(channel: Scalars, name: str, start_ns: int, end_ns: int, low: float
     out, within = [], channel.between(start_ns, end_ns)
     T = within.values[:, 0] if len(within) else channel.values[:1, 0]
     if T.min() < low - MOST_BEYOND_K or T.max() > high + MOST_BEYOND_K:
-        out.append(
-            f"{name} goes from {T.min():.1f} to {T.max():.1f} °C, and training had {low:.1f} to {high:.1f} °C: it is clamped"
-        )
+        gone, trained = f"{T.min():.1f} to {T.max():.1f} °C", f"{low:.1f} to {high:.1f} °C"
+        out.append(f"{name} goes from {gone}, and training had {trained}: beyond that the bias goes on straight, and is less sure")
     edges = np.concatenate([[start_ns], within.t_ns, [end_ns]])
     age_s = float(np.diff(edges).max()) * 1e-9
     if age_s > MOST_AGE_S:

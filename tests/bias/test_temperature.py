@@ -107,10 +107,13 @@ def test_the_states_lag_behind_a_step_by_their_time_constants() -> None:
     np.testing.assert_allclose(later[1:, 0], -np.expm1(-20.0 / LOAD_TAU_S), atol=SAME)
 
 
-def test_the_polynomials_are_those_of_legendre_and_end_with_the_range() -> None:
+def test_the_polynomials_are_those_of_legendre_and_go_on_straight_beyond_the_range() -> None:
+    basis = [np.polynomial.legendre.Legendre.basis(n) for n in (1, 2, 3)]
     inside = TemperatureFilter(CENTRE, HALF)(0, CENTRE + 0.4 * HALF)[:3]
-    np.testing.assert_allclose(inside, [np.polynomial.legendre.Legendre.basis(n)(0.4) for n in (1, 2, 3)], atol=SAME)
-    np.testing.assert_array_equal(TemperatureFilter(CENTRE, HALF)(0, 500.0), TemperatureFilter(CENTRE, HALF)(0, CENTRE + HALF))
+    np.testing.assert_allclose(inside, [p(0.4) for p in basis], atol=SAME)
+    for end in (-1.0, 1.0):
+        beyond = TemperatureFilter(CENTRE, HALF)(0, CENTRE + 1.3 * end * HALF)
+        np.testing.assert_allclose(beyond[:3], [p(end) + 0.3 * end * p.deriv()(end) for p in basis], atol=1e-12)
 
 
 # a log's channel
@@ -240,18 +243,22 @@ def test_training_says_that_several_may_be_meant(caplog: pytest.LogCaptureFixtur
     assert scale.channel == "/b/temperature"
 
 
-def test_another_range_is_clamped_and_told(model: BiasModel) -> None:
-    channel = scalars(np.arange(100.0), np.full(100, CENTRE + 3.0 * HALF))
-    bound = bound_to(model, recording(channel))
-    assert "it is clamped" in bound.remarks[0]
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_beyond_the_range_the_drift_goes_on_and_the_rest_bias_varies_as_far(model: BiasModel, sign: float) -> None:
+    t_s = np.arange(100.0)
+    channel = scalars(t_s, CENTRE + sign * HALF * (1.0 + 0.02 * t_s))
+    bound = bound_to(model, log := recording(channel))
+    assert "goes on straight" in bound.remarks[0]
     assert bound.log_drift is not None
-    np.testing.assert_allclose(bound.log_drift(channel.t_ns)[:, 0], SIZE, atol=STORED)
-    below = scalars(np.arange(100.0), np.full(100, CENTRE - 3.0 * HALF))
-    for log_drift in (bound.log_drift, bound_to(model, recording(below)).log_drift):
-        assert log_drift is not None
-        covariance = log_drift.covariance(channel.t_ns)
-        np.testing.assert_allclose(np.sqrt(covariance[:, 0, 0]), 2.0 * SIZE, rtol=1e-5)  # two half ranges beyond the end
-        assert not covariance[:, 1:, 1:].any()
+    np.testing.assert_allclose(bound.log_drift(channel.t_ns)[:, 0], sign * SIZE * (1.0 + 0.02 * t_s), atol=STORED)
+    assert not bound.log_drift.covariance(channel.t_ns)[:, 1:, 1:].any()
+    beyond = 0.02 * np.arange(0.0, float(log.imu.t_ns[-1] - log.imu.t_ns[0]) * 1e-9, 10.0)
+    assert bound.walk_std[0] == pytest.approx(SIZE * 0.2 / np.sqrt(10.0), rel=1e-3)
+    assert prior(bound).std[0] == pytest.approx(np.hypot(1e-3, SIZE * np.sqrt(np.mean(beyond**2))), rel=0.1)
+    assert bound.walk_std[1] == model.walk_std[1]
+    far = bound_to(model, recording(scalars(t_s, CENTRE + sign * HALF * (1.0 + t_s)))).log_drift
+    assert far is not None
+    assert far(channel.t_ns[-1:])[0, 0] == pytest.approx(sign * 6.0 * SIZE)  # five half ranges on
 
 
 def test_a_long_silence_is_told(model: BiasModel) -> None:
