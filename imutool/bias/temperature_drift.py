@@ -132,7 +132,7 @@ def _remarks(channel: Scalars, name: str, start_ns: int, end_ns: int, low: float
     T = within.values[:, 0] if len(within) else channel.values[:1, 0]
     if T.min() < low - MOST_BEYOND_K or T.max() > high + MOST_BEYOND_K:
         gone, trained = f"{T.min():.1f} to {T.max():.1f} °C", f"{low:.1f} to {high:.1f} °C"
-        out.append(f"{name} goes from {gone}, and training had {trained}: beyond that the bias goes on straight, and is less sure")
+        out.append(f"{name} goes from {gone}, and training had {trained}: beyond, the bias goes on straight and is less sure")
     edges = np.concatenate([[start_ns], within.t_ns, [end_ns]])
     age_s = float(np.diff(edges).max()) * 1e-9
     if age_s > MOST_AGE_S:
