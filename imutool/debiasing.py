@@ -18,8 +18,8 @@ import numpy as np
 from imutool import __version__
 from imutool.array_types import Float64
 from imutool.bias import static
+from imutool.bias.log_binding import rows_without_drift, with_drift
 from imutool.bias.model import BiasModel
-from imutool.bias.temperature_drift import rows_without_drift, with_drift
 from imutool.bias_start import Fitness, model_choice
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias
@@ -248,13 +248,13 @@ def _debias(
         for topic in topics:
             name, survey = given.get(topic) or given.get("") or model_choice.model_of_log(log, topic), surveys.get(topic)
             wrong = model_choice.warn_of_log(log, topic) if survey is None else []
-            chosen, start = model_choice.choose_model_and_start(log, topic, name, options.init, options.smooth, survey)
+            how = (options.init, options.smooth, survey, options.force)
+            chosen, start = model_choice.choose_model_and_start(log, topic, name, *how)
             derived.append(Debiaser(topic, chosen, start, survey, options.watch))
             starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
             fit = model_choice.fitness_in_log(log, topic, chosen, start, survey).beside(wrong)
             fits[topic] = fit.report(models[topic], topic, force=options.force)
             records[topic] = _provenance(topic, chosen, start, options.init, options.smooth)
-
         sieves = {debiaser.source_topic: debiaser.sieve for debiaser in derived}
 
         def metadata(verified: Verified) -> Values:

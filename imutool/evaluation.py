@@ -15,7 +15,7 @@ from msgspec import to_builtins
 from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import GAP_S, BiasModel
-from imutool.bias.model_file import check_rate, find_model
+from imutool.bias.model_file import find_model
 from imutool.bias_start.aided_path import aided_path, residual_prior
 from imutool.bias_start.bias_covariance import ExpectedDrift
 from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std, corrected
@@ -252,15 +252,16 @@ def started(
     *,
     smooth: bool = False,
     refused: Refused | None = None,
+    force: bool = True,
 ) -> Iterator[tuple[str, BiasModel, InitialBias]]:
-    """Model name, model and initial bias in this recording, for each requested model.
+    """Model name, model and initial bias in this recording, for each requested model; with `force` at other rates, too.
 
     With `refused` a model that does not apply to the recording is left out, and `refused` is called with it and the error.
     """
     check_smooth(init, smooth)
     for given, loaded in [(given, _load(given, recording)) for given in models]:  # a model that is none ends it at once
         try:
-            model, start = _model_and_start(loaded, recording, init, where, smooth)
+            model, start = _model_and_start(loaded, recording, init, where, smooth, force)
         except (DataError, ModelError) as error:
             if refused is None:
                 raise
@@ -275,13 +276,11 @@ def _load(given: str | Path, recording: Recording) -> BiasModel | None:
 
 
 def _model_and_start(
-    trained: BiasModel | None, recording: Recording, init: str, where: str | Path, smooth: bool
+    trained: BiasModel | None, recording: Recording, init: str, where: str | Path, smooth: bool, force: bool
 ) -> tuple[BiasModel, InitialBias]:
     if trained is None and init == "auto" and not smooth:
         return estimate_at_rest(recording.imu, where)
-    model: BiasModel = static.Model() if trained is None else bound_to(trained, recording)
-    if trained is not None:
-        check_rate(model, 1.0 / recording.imu.period_s, where, recording.imu.t_ns)
+    model: BiasModel = static.Model() if trained is None else bound_to(trained, recording, where, force=force)
     for remark in model.remarks:
         logger.warning("%s: %s", recording.name, remark)
     if smooth:

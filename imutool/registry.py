@@ -27,7 +27,7 @@ GROUPS = {
 }
 NOT_PLUGINS = {
     "imutool.bias": frozenset(
-        {"effects_stream", "model", "model_file", "networks", "neural_stream", "physics", "temperature", "temperature_drift"}
+        {"effects_stream", "model", "model_file", "networks", "neural_stream", "physics", "temperature", "log_binding"}
     ),
     "imutool.networks": frozenset({"network", "ode", "paper_ode", "perceptron", "temperature", "threads"}),
 }

@@ -459,9 +459,16 @@ def test_no_model_and_no_rest_is_a_refusal_that_says_what_to_do(tmp_path: Path) 
 def test_a_model_for_another_rate_is_refused(source: Path, tmp_path: Path) -> None:
     path = tmp_path / "slow.safetensors"
     save(make_model("linear", 100.0), path)
-    with pytest.raises(ModelError, match=r"flight.mcap: IMU at 200.0 Hz; expected 100.0 Hz.*'slow'"):
+    with pytest.raises(ModelError, match=r"flight.mcap: IMU at 200.0 Hz; expected 100.0 Hz.*'slow'.* with `force`"):
         debias(source, tmp_path / "out.mcap", model=path)
     assert not (tmp_path / "out.mcap").exists()
+    fit = debias(source, tmp_path / "out.mcap", model=path, force=True).fits["/imu0"]
+    assert fit.verdict == "doubtful"
+    assert "samples at 200.00 Hz, in the training runs at 100.00 Hz" in fit.reasons
+    save(make_model("linear", 200.0), tmp_path / "fast.safetensors")
+    debias(source, tmp_path / "same.mcap", model=tmp_path / "fast.safetensors", force=True)
+    forced, same = (read(tmp_path / name, imu="/imu0/debiased").imu for name in ("out.mcap", "same.mcap"))
+    np.testing.assert_array_equal(forced.gyro, same.gyro)
 
 
 def test_another_imu_of_a_known_log_is_not_the_known_sensor(tmp_path: Path) -> None:

@@ -250,7 +250,7 @@ def _debias_recording(recording: Recording, model: object, init: str, smooth: bo
     first_ns = int(recording.imu.t_ns[0]) if len(recording.imu) else 0
     begun = recording.between(first_ns, first_ns + nanoseconds(CHECKED_S))  # as much as the command looks at
     wrong = [text for whole in warn_of_recordings([begun]) for text in contradictions(whole)]
-    name, chosen, start = _model_and_start(recording, model, init, smooth)
+    name, chosen, start = _model_and_start(recording, model, init, smooth, force)
     fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], about).beside(wrong)
     fitness.report(name, recording.name, force=force)
     debiased, std = apply_with_std(chosen, start, recording.imu)
@@ -258,14 +258,16 @@ def _debias_recording(recording: Recording, model: object, init: str, smooth: bo
     return DebiasedRecording(replace(recording, imu=debiased.imu, metadata=marked), debiased.bias, std, name, start, fitness)
 
 
-def _model_and_start(recording: Recording, model: Model | None, init: str, smooth: bool) -> tuple[str, BiasModel, InitialBias]:
+def _model_and_start(
+    recording: Recording, model: Model | None, init: str, smooth: bool, force: bool
+) -> tuple[str, BiasModel, InitialBias]:
     if model is None:
         model = next(iter(shipped_for(recording.metadata.get("imutool", {}))), static.Model.method)
     if not isinstance(model, BiasModel) or model.method == static.Model.method:
         given = static.Model.method if isinstance(model, BiasModel) else model
-        ((name, chosen, start),) = evaluation.started(recording, [given], init, recording.name, smooth=smooth)
+        ((name, chosen, start),) = evaluation.started(recording, [given], init, recording.name, smooth=smooth, force=force)
         return name, chosen, start
     check_smooth(init, smooth)
-    model = bound_to(model, recording)
+    model = bound_to(model, recording, force=force)
     start = smooth_in_memory(model, recording.imu, recording.name) if smooth else find_initial_bias(init, model, recording)
     return str(model.card.get("name", model.method)), model, start

@@ -78,6 +78,7 @@ class Model(BiasModel):
 
     method: ClassVar[str] = "conv"
     config: Config
+    counts_samples = True
 
     @classmethod
     def shapes(cls, config: Settings) -> Shapes:

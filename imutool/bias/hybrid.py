@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import msgspec
 import numpy as np
@@ -67,6 +67,7 @@ class Model(BiasModel):
         if self.config.remainder:
             held = {name.removeprefix("ode."): value for name, value in self.tensors.items() if name.startswith("ode.")}
             self.ode = neural_ode.Model(self.config.ode, rate_hz, held)
+            self.counts_samples = self.ode.counts_samples
 
     @classmethod
     def shapes(cls, config: Settings) -> Shapes:
@@ -83,6 +84,12 @@ class Model(BiasModel):
             shapes |= {f"theta_{sensor}": (size,), f"covariance_{sensor}": (size, size)}
         ode = neural_ode.Model.shapes(config.ode) if config.remainder else {}
         return shapes | {f"ode.{name}": shape for name, shape in ode.items()}
+
+    def at(self, rate_hz: float) -> Self:
+        """Model for samples at another rate."""
+        out = super().at(rate_hz)
+        out.ode = None if self.ode is None else self.ode.at(rate_hz)
+        return out
 
     def error(self, sensor: Sensor, signals: Signals) -> Float64[np.ndarray, "n 3"]:
         """Error of the effects at some signals (rad/s or m/s²)."""

@@ -9,10 +9,11 @@ Inference is numpy. A trained method has a network in torch, `imutool.bias.netwo
 
 from __future__ import annotations
 
+import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -25,7 +26,6 @@ from imutool.units import SENSORS, Sensor
 COLUMNS = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of a vector of six
 MOST_BIAS = 1e6  # rad/s and m/s²: more is no bias
 STATISTICS = ("prior_mean", "prior_std", "truth_std", "rest_std", "walk_std", "noise_std")
-
 GAP_S = 1.0  # a longer step of the stamps begins a new stretch: filters of the samples start anew, and no drift is integrated
 
 Vector6 = Float64[np.ndarray, "6"]  # gyro (rad/s) then accel (m/s²)
@@ -68,10 +68,7 @@ class RestBiasEstimator(Protocol):
 
 @runtime_checkable
 class SampleStream(Stream, Protocol):
-    """Bias stream with a fast path for one sample.
-
-    A block call spends half its time on slicing arrays.
-    """
+    """Bias stream with a fast path for one sample: a block call spends half its time on slicing arrays."""
 
     def one(self, t_s: float, u: Vector6) -> Vector6:
         """Bias at one sample (gyro, then accel), as a block of this sample gives; the caller owns the array."""
@@ -125,11 +122,12 @@ class BiasModel(ABC):
     It computes in float64; files store float32. `tensors` are the weights and statistics by name, with the shapes of `shapes`;
     missing ones are zero. `log_drift` is the drift in the log that the model is bound to; its streams take samples without
     this drift. `remarks` lists the reasons for a larger uncertainty. `load_before` is the load on the sensor before the log, if
-    it was warm at the start (`imutool.bias_start.earlier_load`).
+    it was warm at the start (`imutool.bias_start.earlier_load`). `trained_hz` is set where `rate_hz` is not that of training.
     """
 
     method: ClassVar[str]
     card: Mapping[str, Any]
+    counts_samples, trained_hz = False, 0.0  # samples instead of seconds: it works at the rate of its training alone
     log_drift: LogDrift | None = None
     remarks: tuple[str, ...] = ()
     load_before: Float64[np.ndarray, "3 11"] | None = None
@@ -142,6 +140,11 @@ class BiasModel(ABC):
     def __repr__(self) -> str:
         name = str(self.card.get("name", self.method))
         return f"<bias model {name!r}: {self.method}, {f'{self.rate_hz:g} Hz' if self.rate_hz else 'any rate'}>"
+
+    def at(self, rate_hz: float) -> Self:
+        """Model for samples at another rate."""
+        (out := copy.copy(self)).trained_hz, out.rate_hz = self.trained_hz or self.rate_hz, rate_hz
+        return out
 
     @classmethod
     def shapes(cls, config: Settings) -> Shapes:
@@ -241,12 +244,10 @@ class _Stretches:
 
     def one(self, t_s: float, u: Vector6) -> Vector6:
         """Bias at one sample."""
-        step = t_s - self._before_s
-        if step > GAP_S or step < 0.0:
+        if not 0.0 <= t_s - self._before_s <= GAP_S and not math.isnan(self._before_s):
             self._begin()
         self._before_s = t_s
-        if math.isnan(self._start_s):
-            self._start_s = t_s
+        self._start_s = t_s if math.isnan(self._start_s) else self._start_s
         bias: Vector6 = self._stream(np.array([t_s]), u[None, :3], u[None, 3:])[0] if self._one is None else self._one(t_s, u)
         return bias
 

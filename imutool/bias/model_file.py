@@ -16,7 +16,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as save_bytes
 
 from imutool import registry
-from imutool.array_types import Int64
 from imutool.bias.model import BiasModel, check_card
 from imutool.config import build, plain
 from imutool.errors import ImutoolError, ModelError, did_you_mean
@@ -29,15 +28,13 @@ MAX_WEIGHT = 1e6  # the largest of the shipped models is 10
 MIN_SCALE = 1e-9  # of an input that a network divides by
 MAX_TOML = 1 << 20  # bytes of a physics.toml; usual files have a few thousand
 MAX_SETTINGS = 16 << 10  # characters; usual settings have a few hundred
-WITH_RATE = ("conv", "hybrid", "neural_ode")  # their networks count in samples
+WITH_RATE = ("conv", "hybrid", "neural_ode")  # their filters need it
 BEST_FIRST = ("hybrid", "neural_ode", "linear", "conv")  # by published results and docs/accuracy.md
 UNITS = {  # sensor and data set of the shipped models: the names of the sequences that this one unit recorded
     ("adis16448", "euroc"): r"(MH_0[1-5]|V[12]_0[1-3])(_(easy|medium|difficult))?",
     ("bmi160", "tum_vi"): r"(room|corridor|magistrale|outdoors|slides|calib-cam|calib-imu)[1-9]?",
     ("fetch", "fetch"): r"0[1-8]_(square|um|eight|random|right_turn|left_turn|origin)",
 }
-BATCHES = "The stamps come in batches: imutool convert LOG OUT --restamp puts them on the clock of the sensor"
-RATE_TOLERANCE = 0.05  # a real rate differs from its nominal one by a few per mille (BMI160: 199.4 for 200)
 
 
 def save(model: BiasModel, path: Path, *, overwrite: bool = False) -> None:
@@ -240,22 +237,6 @@ def shipped_for(about: Mapping[str, str]) -> list[str]:
 def digest(path: Path) -> str:
     """SHA-256 of a model file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def check_rate(model: BiasModel, rate_hz: float, where: object, t_ns: Int64[np.ndarray, " n"] | None = None) -> None:
-    """Refuse a log at another rate than the training logs; its times show stamps in batches.
-
-    Raises:
-        ModelError: the rates differ by more than 5 %.
-    """
-    if not model.rate_hz or abs(rate_hz / model.rate_hz - 1) < RATE_TOLERANCE:
-        return
-    mean_hz = 1e9 * (len(t_ns) - 1) / max(int(t_ns[-1] - t_ns[0]), 1) if t_ns is not None else 0.0
-    batches = abs(mean_hz / model.rate_hz - 1) < RATE_TOLERANCE
-    what = f"IMU at {rate_hz:.1f} Hz{f' by most of its steps, and {mean_hz:.1f} Hz in the mean' if batches else ''}"
-    expected = f"{model.rate_hz:.1f} Hz, at which model {model.card.get('name', model.method)!r} was trained"
-    fix = BATCHES if batches else "Choose or train a model for this sensor"
-    raise ModelError(what, where=where, expected=expected, fix=fix)
 
 
 def header_of(path: Path) -> dict[str, Any]:

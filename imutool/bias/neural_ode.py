@@ -107,6 +107,10 @@ class Model(BiasModel):
     method: ClassVar[str] = "neural_ode"
     config: Config
 
+    def __init__(self, config: Settings, rate_hz: float, tensors: Mapping[str, np.ndarray] | None = None) -> None:
+        super().__init__(config, rate_hz, tensors)
+        self.counts_samples = self.config.paper
+
     @classmethod
     def shapes(cls, config: Settings) -> Shapes:
         """Shapes of the statistics, curves and drifts.

@@ -15,9 +15,8 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from imutool.array_types import Bool, Float64
+from imutool.bias.log_binding import OnlineDrift, at_rate, bound
 from imutool.bias.model import GAP_S, BiasModel, SampleStream, Stream, Vector6
-from imutool.bias.model_file import check_rate
-from imutool.bias.temperature_drift import OnlineDrift, bound
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias, model_samples, tracked_from_prior
 from imutool.bias_start.stretches import LEAST_FORCE_M_S2, MOST, measured, unusual_gravity
@@ -242,7 +241,7 @@ class OnlineDebiaser:
             logger.warning(what, repeated, len(first))
             periods.append(float(t_ns[-1] - t_ns[0]) * 1e-9 / int(counts[:-1].sum()))
         rates = [1.0 / period_s for period_s in periods]
-        check_rate(self._model, min(rates, key=lambda hz: abs(hz - (self._model.rate_hz or hz))), "OnlineDebiaser")
+        at_rate(self._model, min(rates, key=lambda hz: abs(hz - (self._model.rate_hz or hz))), "OnlineDebiaser")
         if wrong := unusual_gravity(np.array([accel for _, accel in first])):
             logger.warning("OnlineDebiaser: %s", wrong)
 

@@ -269,8 +269,9 @@ def _other_conditions(model: BiasModel, samples: Samples) -> list[str]:
     if ratio > MOST_NOISE:  # less noise is no doubt: a drone in the hand has a tenth of that in flight
         sentences.append(f"the samples are {ratio:.0f} times as noisy as in the training runs: another sensor, or vibration")
     rate_hz = 1.0 / float(quantile(np.diff(samples[0]), 0.5))
-    if model.rate_hz and abs(rate_hz / model.rate_hz - 1.0) > MOST_RATE:
-        sentences.append(f"samples at {rate_hz:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
+    trained_hz = model.trained_hz or model.rate_hz
+    if trained_hz and abs(rate_hz / trained_hz - 1.0) > MOST_RATE:
+        sentences.append(f"samples at {rate_hz:.2f} Hz, in the training runs at {trained_hz:.2f} Hz")
     return sentences
 
 

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Float64
+from imutool.bias.log_binding import without_drift
 from imutool.bias.model import (
     GAP_S,
     BiasEstimate,
@@ -29,7 +30,6 @@ from imutool.bias.model import (
     Stream,
     Vector6,
 )
-from imutool.bias.temperature_drift import without_drift
 from imutool.bias_start.bias_tracking import (
     BiasTrajectory,
     Samples,

@@ -14,9 +14,9 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.bias import static
+from imutool.bias.log_binding import at_rate, bound, rows_without_drift, without_drift
 from imutool.bias.model import BiasModel
-from imutool.bias.model_file import check_rate, shared_model, shipped, shipped_for
-from imutool.bias.temperature_drift import bound, rows_without_drift, without_drift
+from imutool.bias.model_file import shared_model, shipped, shipped_for
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
 from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
@@ -132,35 +132,35 @@ def model_of_log(log: Log, topic: str) -> str | Path | None:
 
 
 def choose_model_and_start(
-    log: Log, topic: str, name: str | Path | None, init: str, smooth: bool, survey: Survey | None
+    log: Log, topic: str, name: str | Path | None, init: str, smooth: bool, survey: Survey | None, force: bool
 ) -> tuple[BiasModel, InitialBias]:
     """Bias model and initial bias for one IMU of a log."""
     untrained = name is None or str(name) == static.Model.method
     first_minute = _first_minute(log, topic, init, survey)
-    period_s = first_minute.imu.period_s
+    period_s, start_ns = first_minute.imu.period_s, int(first_minute.imu.t_ns[0])
     if untrained and init == "auto" and not smooth:
         batches = ((t_ns, batch.gyro, batch.accel) for batch, t_ns in _imu_batches(log, topic, survey))
         return _estimate(block_statistics(batches, period_s), log.path)
     model: BiasModel = static.Model() if name is None or untrained else shared_model(name, 1.0 / period_s)
-    if not untrained:
-        check_rate(model, 1.0 / period_s, log.path, first_minute.imu.t_ns)
+    model = at_rate(model, 1.0 / period_s, log.path, first_minute.imu.t_ns, force=force)
     if model.temperature_parameters():
-        start_ns = int(first_minute.imu.t_ns[0])
         model = bound(model, temperatures(log), topic, start_ns, start_ns + _duration_ns(log, topic))
-    model = with_earlier_load(model, _Batches(log, topic, survey, model), int(first_minute.imu.t_ns[0]))
+    model = with_earlier_load(model, _Batches(log, topic, survey, model), start_ns)
     if smooth:
-        start = _smoothed(model, _Batches(log, topic, survey, model), log.path, int(first_minute.imu.t_ns[0]))
+        start = _smoothed(model, _Batches(log, topic, survey, model), log.path, start_ns)
     else:
         start = find_initial_bias(init, model, first_minute)
     return model, start if start.noise.any() else replace(start, noise=_noise(first_minute.imu))
 
 
-def bound_to(model: BiasModel, recording: Recording) -> BiasModel:
-    """Model with its drift in a recording.
+def bound_to(model: BiasModel, recording: Recording, where: str | Location = "", *, force: bool = True) -> BiasModel:
+    """Model at a recording's rate, that follows its temperature and begins at the load that the sensor bore before.
 
-    It follows the recorded temperature, and begins at the load that the sensor bore before.
+    Raises:
+        ModelError: as `at_rate`.
     """
     t_ns = recording.imu.t_ns
+    model = at_rate(model, 1.0 / recording.imu.period_s, where or recording.name, t_ns, force=force)
     model = bound(model, recording.scalars, recording.imu_topic, int(t_ns[0]), int(t_ns[-1]))
     if not model.follows_load():
         return model

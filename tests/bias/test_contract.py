@@ -21,8 +21,9 @@ from safetensors.torch import save_file
 
 from imutool import registry
 from imutool.bias import model_file
+from imutool.bias.log_binding import at_rate
 from imutool.bias.model import BiasModel
-from imutool.bias.model_file import MAX_BYTES, check_rate, find_model, header_of, load, save
+from imutool.bias.model_file import MAX_BYTES, find_model, header_of, load, save
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.errors import ConfigError, ModelError
 from imutool.units import SENSORS
@@ -400,19 +401,35 @@ def test_models_that_ship_are_found_by_name(saved: Path, monkeypatch: pytest.Mon
 
 def test_another_rate_is_refused_and_a_nearly_equal_one_is_not(model: BiasModel) -> None:
     for rate_hz in (RATE_HZ, 0.996 * RATE_HZ, 1.049 * RATE_HZ, 0.951 * RATE_HZ):
-        check_rate(model, rate_hz, "log.mcap")
+        assert at_rate(model, rate_hz, "log.mcap") is model
     for rate_hz in (100.0, 400.0, 1.051 * RATE_HZ, 0.949 * RATE_HZ):
         with pytest.raises(ModelError, match=rf"log.mcap: IMU at {rate_hz:.1f} Hz; expected 200.0 Hz"):
-            check_rate(model, rate_hz, "log.mcap")
+            at_rate(model, rate_hz, "log.mcap")
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 400.0, 1000.0])
+def test_a_model_that_counts_in_seconds_goes_at_another_rate_by_force(
+    network: BiasNetwork, model: BiasModel, rate_hz: float, segment: MakeSegment
+) -> None:
+    if model.counts_samples or rate_hz > 4.5 * RATE_HZ:
+        with pytest.raises(ModelError, match="Choose or train"):
+            at_rate(model, rate_hz, "log.mcap", force=True)
+        return
+    found = at_rate(model, rate_hz, "log.mcap", force=True)
+    assert (found.rate_hz, found.trained_hz, model.rate_hz) == (rate_hz, RATE_HZ, RATE_HZ)
+    slow = type(network)(network.config, rate_hz).double()  # the same weights, made for that rate
+    slow.load_state_dict(network.state_dict())
+    seen = segment(5, 1, 200)
+    np.testing.assert_array_equal(streamed(found, seen, [70]), streamed(slow.frozen(), seen, [70]))
 
 
 def test_stamps_in_batches_are_named_and_not_another_sensor(model: BiasModel) -> None:
     number = np.arange(400)
     t_ns = number // 4 * 20_000_000 + number % 4 * 150_000  # four samples at once, every 20 ms
     with pytest.raises(ModelError, match=r"IMU at 6666.7 Hz by most of its steps, and 20\d.\d Hz in the mean.* --restamp"):
-        check_rate(model, 1e9 / 150_000, "log.mcap", t_ns)
+        at_rate(model, 1e9 / 150_000, "log.mcap", t_ns, force=True)
     with pytest.raises(ModelError, match="Choose or train a model for this sensor"):
-        check_rate(model, 1e9 / 150_000, "log.mcap", 150_000 * number)
+        at_rate(model, 1e9 / 150_000, "log.mcap", 150_000 * number)
 
 
 def test_the_settings_in_a_header_are_json(saved: Path) -> None:

@@ -19,13 +19,13 @@ from mcap_ros2.writer import Writer as Ros2Writer
 from support.robot_cases.log import DEFINITIONS
 
 import imutool
+from imutool.bias.log_binding import OnlineDrift
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import load, save
 from imutool.bias.networks import hybrid
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.temperature import temperature_scale, temperature_tensors
 from imutool.bias.temperature import FORMS, Scale, TemperatureFilter, channel_of
-from imutool.bias.temperature_drift import OnlineDrift
 from imutool.bias_start.correction import apply
 from imutool.bias_start.initial_bias import prior, tracked_from_prior
 from imutool.bias_start.model_choice import bound_to, find_initial_bias

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Bool, Float64
+from imutool.bias.log_binding import with_drift, without_drift
 from imutool.bias.model import BiasModel
-from imutool.bias.temperature_drift import with_drift, without_drift
 from imutool.bias_start.bias_covariance import BiasEstimator, drift_by_bias, stacked
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.geometry import quaternion

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from imutool.bias.log_binding import started_at, without_drift
 from imutool.bias.model import GAP_S, BiasModel
-from imutool.bias.temperature_drift import started_at, without_drift
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import auto
 from imutool.bias_start.correction import OnlineDebiaser
@@ -28,7 +28,7 @@ from imutool.recording.columns import clock_jumps, jump_warnings
 from imutool.viewing.stream import Delay, StreamStatistics
 from imutool.viewing.stream.samples import MOST_NS, Malformed, Sample
 from imutool.viewing.stream.sources import Samples, timely
-from imutool.viewing.stream.stream_fit import STREAM, SWITCH_S, StreamFit, check_first, imu_of
+from imutool.viewing.stream.stream_fit import STREAM, SWITCH_S, StreamFit, at_rate_of, imu_of
 
 START_S = 2.0  # of the stream, from which the initial bias is taken
 BATCH_S = 0.1  # shown together
@@ -179,7 +179,7 @@ class _Session:
             (slice(*ends) for ends in pairwise([*self._stretches, len(self._first)])), key=lambda run: run.stop - run.start
         )
         seen = imu_of(self._first[run])
-        check_first(seen, self._model)
+        self._model = at_rate_of(seen, self._model, force=self._force)
         warm = sorted((found.stamp_ns, float(t)) for found in self._first[run] if (t := found.temperature) is not None)
         first_ns, last_ns = int(seen.t_ns[0]), int(seen.t_ns[-1])
         model = started_at(self._model, warm, first_ns, last_ns)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from imutool.bias.log_binding import at_rate
 from imutool.bias.model import BiasModel
-from imutool.bias.model_file import check_rate
 from imutool.bias_start import Fitness
 from imutool.bias_start.fitness import CHECKED_S, judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
@@ -37,19 +37,20 @@ def imu_of(samples: Sequence[Sample]) -> Imu:
     return Imu(t_ns[good], gyro[good], accel[good])
 
 
-def check_first(imu: Imu, model: BiasModel) -> None:
-    """Refuse first samples that a model cannot start from.
+def at_rate_of(imu: Imu, model: BiasModel, *, force: bool) -> BiasModel:
+    """Model at the rate of the first samples.
 
     Raises:
         DataError: none is a measurement, or stamps that are not in nanoseconds.
-        ModelError: a rate at which the model was not trained.
+        ModelError: as `at_rate`.
     """
     if not len(imu):
         expected = "finite samples with a specific force"
         raise DataError("none of the first samples is a measurement", where=STREAM, expected=expected)
-    if len(imu) > 1:
-        imu.check_rate(STREAM)
-        check_rate(model, 1.0 / imu.period_s, STREAM, imu.t_ns)
+    if len(imu) < 2:
+        return model
+    imu.check_rate(STREAM)
+    return at_rate(model, 1.0 / imu.period_s, STREAM, imu.t_ns, force=force)
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Drift of a bias with the temperature of one log or stream; models bound to it."""
+"""Models bound to one log or stream: to its rate, and to its temperature, which the bias may follow."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.bias.model import COLUMNS, BiasModel, Covariances, Vector6
 from imutool.bias.temperature import TemperatureFilter, celsius_of, channel_of, holding, scale_of
+from imutool.errors import ModelError
 from imutool.mcap_io.temperature import EVERY_NS, is_temperature, thinned
 from imutool.recording import Imu, Scalars
 from imutool.sensor.signals import TEMPERATURE_TERMS
 
+RATE_TOLERANCE = 0.05  # a real rate differs from its nominal one by a few per mille (BMI160: 199.4 for 200)
+MOST_FACTOR = 4.5  # between the rates of training and log
+BATCHES = "The stamps come in batches: imutool convert LOG OUT --restamp puts them on the clock of the sensor"
 MOST_AGE_S = 60.0  # of a number of the channel: a case warms within minutes
 SET_BACK = 2  # half seconds: further back the clock was set, and the sample is not late
 WALK_NS = 10_000_000_000  # between two numbers of a drift, from which its walk is taken
@@ -22,6 +26,30 @@ MOST_BEYOND_K = 1.0  # beyond the trained range, before it counts as another one
 Rows3 = Float64[np.ndarray, "n 3"]
 Rows6 = Float64[np.ndarray, "n 6"]
 Stamps = Int64[np.ndarray, " n"]
+
+
+def at_rate(model: BiasModel, rate_hz: float, where: object, t_ns: Stamps | None = None, *, force: bool = False) -> BiasModel:
+    """Model for samples at a rate; within 5 % of that of its training it is the model itself.
+
+    With `force` another rate may be as far away as `MOST_FACTOR`: filters and drifts have their times in seconds. The times of
+    the samples show stamps in batches.
+
+    Raises:
+        ModelError: another rate without `force`, or too far away, a model that counts samples, or stamps in batches.
+    """
+    if not model.rate_hz or abs(rate_hz / model.rate_hz - 1) < RATE_TOLERANCE:
+        return model
+    mean_hz = 1e9 * (len(t_ns) - 1) / max(int(t_ns[-1] - t_ns[0]), 1) if t_ns is not None else 0.0
+    batches = abs(mean_hz / model.rate_hz - 1) < RATE_TOLERANCE
+    possible = not (batches or model.counts_samples) and 1 / MOST_FACTOR < rate_hz / model.rate_hz < MOST_FACTOR
+    if possible and force:
+        return model.at(rate_hz)
+    what = f"IMU at {rate_hz:.1f} Hz{f' by most of its steps, and {mean_hz:.1f} Hz in the mean' if batches else ''}"
+    expected = f"{model.rate_hz:.1f} Hz, at which model {model.card.get('name', model.method)!r} was trained"
+    fix = BATCHES if batches else "Choose or train a model for this sensor"
+    if possible:
+        fix += f", or use it at this rate with `force` (an OnlineDebiaser with `model.at({rate_hz:.0f})`)"
+    raise ModelError(what, where=where, expected=expected, fix=fix)
 
 
 class TemperatureDrift:
@@ -144,7 +172,7 @@ def _widened(model: BiasModel, spread: Vector6, walk: Vector6) -> BiasModel:
     """Model whose rest bias varies as a drift that is not subtracted; changes the model."""
 
     def wider(std: Vector6) -> Vector6:
-        return np.sqrt(np.asarray(std) ** 2 + spread**2)
+        return np.asarray(np.sqrt(np.asarray(std) ** 2 + spread**2))
 
     model.tensors = model.tensors | {
         "prior_std": wider(model.prior_std),
