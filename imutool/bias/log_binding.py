@@ -1,4 +1,4 @@
-"""Models bound to one log or stream: to its rate, and to its temperature, which the bias may follow."""
+"""Models bound to one log or stream: to its rate, and to its temperature."""
 
 from __future__ import annotations
 

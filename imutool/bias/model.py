@@ -68,7 +68,7 @@ class RestBiasEstimator(Protocol):
 
 @runtime_checkable
 class SampleStream(Stream, Protocol):
-    """Bias stream with a fast path for one sample: a block call spends half its time on slicing arrays."""
+    """Bias stream with a fast path for one sample; half of a block call is slicing."""
 
     def one(self, t_s: float, u: Vector6) -> Vector6:
         """Bias at one sample (gyro, then accel), as a block of this sample gives; the caller owns the array."""

@@ -154,7 +154,7 @@ def choose_model_and_start(
 
 
 def bound_to(model: BiasModel, recording: Recording, where: str | Location = "", *, force: bool = True) -> BiasModel:
-    """Model at a recording's rate, that follows its temperature and begins at the load that the sensor bore before.
+    """Model at a recording's rate, with the drifts by its temperature and by the load before.
 
     Raises:
         ModelError: as `at_rate`.
