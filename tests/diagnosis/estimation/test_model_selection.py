@@ -130,10 +130,19 @@ def test_a_bias_that_walks_is_no_drift() -> None:
 def test_a_bias_that_walks_is_no_step_however_fast_and_whatever_the_other_sensor_does(
     sensor: str, corner_hz: float, seed: int
 ) -> None:
+    assert names(asked(walking_fast(sensor, corner_hz, seed), beyond=False)) == []
+
+
+@pytest.mark.parametrize(("seed", "beyond"), [(6, False), (4, True)])
+def test_a_bias_that_walks_fast_neither_follows_the_motion_nor_is_a_curve(seed: int, beyond: bool) -> None:
+    assert names(asked(walking_fast("gyro", 1.5, seed), beyond)) == []
+
+
+def walking_fast(sensor: str, corner_hz: float, seed: int) -> Pair:
     felt = planted.rich(seed + 1, WALK_S)
     steps = 2.0 * np.pi * corner_hz / planted.RATE_HZ * planted.noise(len(felt.t_s), seed + 1000)
     steps *= np.repeat([sensor != "accel", sensor != "gyro"], 3)
-    assert names(asked(planted.pair(felt, {}, seed, added=np.cumsum(steps, axis=0)), beyond=False)) == []
+    return planted.pair(felt, {}, seed, added=np.cumsum(steps, axis=0))
 
 
 STEPS = {
