@@ -793,6 +793,14 @@ def test_a_dead_band_of_noisy_readings_is_as_unsure_as_its_edges_are() -> None:
     assert sure(found, "gyro_dead_band", [width])
 
 
+def test_a_dead_zone_whose_faster_readings_lose_its_width_is_a_dead_band() -> None:
+    """It was a scale of one axis and signs of the other two."""
+    found = asked(planted.pair(planted.rich(), {"gyro_dead_band": [0.02, 1.0]}))
+    assert names(found) == ["gyro_dead_band:zone"]
+    assert sure(found, "gyro_dead_band:zone", [0.02])
+    assert [value for _, value in found.selected[0].effect.constants] == [1.0]
+
+
 def test_a_low_pass_above_what_samples_can_show_is_told_by_its_delay() -> None:
     """Beside an exact simulation; what smoothed poses say ends six times above their band, and beyond it is a delay."""
     pair = planted.pair(planted.shaken(), {"low_pass": [48.0]})
