@@ -22,13 +22,14 @@ class WalkLikelihood(NamedTuple):
     """Likelihood of sizes of a walk: squares left, logarithms of determinants.
 
     The determinants are those beside all parameters, and beside a constant alone. `fitted` are the squares of the residual as
-    it was fitted, beside the best constant.
+    it was fitted, beside the best constant, and `within` is the variance of its samples about the means of their blocks.
     """
 
     squares: Steps
     log_determinant: Steps
     beside_constant: Steps
     fitted: float
+    within: float
     free: int
 
     def white(self) -> Steps:
@@ -77,7 +78,8 @@ def walk_likelihood(
         squares[k] = y / variance @ y - g @ np.linalg.solve(N, g)
         log_determinant[k] = np.log(variance).sum() + np.linalg.slogdet(N)[1]
         beside_constant[k] = np.log(variance).sum() + np.log(max(float(constant / variance @ constant), 1e-300))
-    return WalkLikelihood(squares, log_determinant, beside_constant, float(y @ y - (y @ constant) ** 2), free)
+    within = float(residual @ residual - y @ y) / max(1, len(residual) - len(y))
+    return WalkLikelihood(squares, log_determinant, beside_constant, float(y @ y - (y @ constant) ** 2), within, free)
 
 
 @lru_cache(maxsize=8)

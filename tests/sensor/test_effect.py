@@ -472,19 +472,19 @@ def test_a_hysteresis_starts_at_its_width_beside_a_bias_and_noise() -> None:
     assert start[0] == pytest.approx(0.1, rel=0.2)
 
 
-@pytest.mark.parametrize("width", [0.02, 0.3])
-def test_a_dead_band_starts_at_its_width_beside_a_bias_and_noise(width: float) -> None:
+@pytest.mark.parametrize(("width", "lost"), [(0.02, 0), (0.3, 0), (0.3, 1)])
+def test_a_dead_band_starts_at_its_width_beside_a_bias_and_noise(width: float, lost: int) -> None:
     felt = lively()
     noise = np.random.default_rng(1).normal(0.0, 0.003, felt.gyro.shape)
-    gyro = np.where(np.abs(felt.gyro) < width, 0.0, felt.gyro) + noise + np.array([0.01, -0.02, 0.005])
+    past = felt.gyro - lost * width * np.sign(felt.gyro)
+    gyro = np.where(np.abs(felt.gyro) < width, 0.0, past) + noise + np.array([0.01, -0.02, 0.005])
     read = felt.sample(felt.t_s, felt.t_s).with_readings(gyro)
     starts = only("gyro_dead_band").starts
     assert starts is not None
-    (start,) = starts(felt, read)
-    assert start[0] == pytest.approx(width, rel=0.2)
-    out = act("gyro_dead_band", felt.sample(felt.t_s, felt.t_s), width)
+    assert starts(felt, read)[lost] == pytest.approx([width, lost], rel=0.2)
+    out = act("gyro_dead_band", felt.sample(felt.t_s, felt.t_s), width, float(lost))
     assert (out.gyro[np.abs(felt.gyro) < 0.98 * width] == 0.0).all()
-    close(out.gyro[np.abs(felt.gyro) > 1.02 * width], felt.gyro[np.abs(felt.gyro) > 1.02 * width])
+    close(out.gyro[np.abs(felt.gyro) > 1.02 * width], past[np.abs(felt.gyro) > 1.02 * width])
 
 
 @pytest.mark.parametrize("f_hz", [0.5, 3.0, 11.0, 27.0, 50.0])

@@ -44,6 +44,7 @@ from imutool.diagnosis.estimation.unnamed_effects import smoothing, with_finer_c
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.processes.forked import Forked, of_each
 from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.effects.gyro_dead_band import ZONE
 
 
 def select_effects(
@@ -125,8 +126,9 @@ class _Search(Trial):
 
     @property
     def searched(self) -> tuple[Effect, ...]:
-        """Named candidates, but for low-passes that come in as the form of another."""
-        return tuple(one for one in self.named if not one.constants and (one.name != LOW_PASSES[1] or not one.variant))
+        """Named candidates, but for those that come in as the form of another."""
+        own = (one for one in self.named if not one.constants or one.variant == ZONE)
+        return tuple(one for one in own if (one.name != LOW_PASSES[1] or not one.variant))
 
     def removable(self, now: Fit) -> range:
         """Indices of effects but for those of every fit and the last, which has just come in."""

@@ -91,16 +91,20 @@ def gain_of(whole: Fit, k: int, iterations: int | None = None) -> tuple[float, f
 
 
 def _gain_without(whole: Fit, left_out: Sequence[int], iterations: int | None) -> tuple[float, float]:
-    """Squares that leaving some effects out costs, at most, and those that no walk of a bias saves."""
+    """Squares that leaving some effects out costs, at most, and those that no walk of a bias saves.
+
+    Walks of any speed count for what depends on time alone, and for all where what is left walks.
+    """
+    search = whole.logs[0].pair.settings.search
     chosen = tuple(entry for j, entry in enumerate(whole.chosen) if j not in left_out)
     without = fit(whole.logs, chosen, part=whole.part, iterations=iterations, near=whole)
     jumps = any(effect.jumps for effect, _ in without.chosen)  # what moves a signal a little wins single samples at an edge
     gain = (without.objective - whole.objective) / (whole.settings.between_samples**2 if jumps else 1.0)
     if iterations is not None:
         return gain, gain
-    explained, left = (
-        squares_of_walk(one, whole, of_any_speed=whole.chosen[left_out[0]][0].of_time) for one in (without, whole)
-    )
+    walks = squares_of_walk(whole, whole, of_any_speed=True) > search.clearly_better
+    of_any_speed = whole.chosen[left_out[0]][0].of_time or walks
+    explained, left = (squares_of_walk(one, whole, of_any_speed=of_any_speed) for one in (without, whole))
     return gain, gain - max(0.0, explained - left)
 
 

@@ -130,10 +130,19 @@ def test_a_bias_that_walks_is_no_drift() -> None:
 def test_a_bias_that_walks_is_no_step_however_fast_and_whatever_the_other_sensor_does(
     sensor: str, corner_hz: float, seed: int
 ) -> None:
+    assert names(asked(walking_fast(sensor, corner_hz, seed), beyond=False)) == []
+
+
+@pytest.mark.parametrize(("seed", "beyond"), [(6, False), (4, True)])
+def test_a_bias_that_walks_fast_neither_follows_the_motion_nor_is_a_curve(seed: int, beyond: bool) -> None:
+    assert names(asked(walking_fast("gyro", 1.5, seed), beyond)) == []
+
+
+def walking_fast(sensor: str, corner_hz: float, seed: int) -> Pair:
     felt = planted.rich(seed + 1, WALK_S)
     steps = 2.0 * np.pi * corner_hz / planted.RATE_HZ * planted.noise(len(felt.t_s), seed + 1000)
     steps *= np.repeat([sensor != "accel", sensor != "gyro"], 3)
-    assert names(asked(planted.pair(felt, {}, seed, added=np.cumsum(steps, axis=0)), beyond=False)) == []
+    return planted.pair(felt, {}, seed, added=np.cumsum(steps, axis=0))
 
 
 STEPS = {
@@ -782,6 +791,14 @@ def test_a_dead_band_of_noisy_readings_is_as_unsure_as_its_edges_are() -> None:
     found = select_effects([whitened(replace(pair, real=real), every, pair.settings.band)], planted.catalogue())
     assert names(found) == ["gyro_dead_band"]
     assert sure(found, "gyro_dead_band", [width])
+
+
+def test_a_dead_zone_whose_faster_readings_lose_its_width_is_a_dead_band() -> None:
+    """It was a scale of one axis and signs of the other two."""
+    found = asked(planted.pair(planted.rich(), {"gyro_dead_band": [0.02, 1.0]}))
+    assert names(found) == ["gyro_dead_band:zone"]
+    assert sure(found, "gyro_dead_band:zone", [0.02])
+    assert [value for _, value in found.selected[0].effect.constants] == [1.0]
 
 
 def test_a_low_pass_above_what_samples_can_show_is_told_by_its_delay() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from imutool.diagnosis.estimation.observability import LOW_PASSES, SHARED
 from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.effects.gyro_dead_band import LOST, ZONE
 from imutool.sensor.effects.gyro_hysteresis import LEAST, SHARE, error_and_ideal, play
 from imutool.sensor.effects.low_pass import ORDER, RATE, SMOOTHING, of_one
 from imutool.sensor.effects.mount_resonance import DAMPER
@@ -22,7 +23,7 @@ WIDTHS = 0.3, 1.0  # of the motion's standard deviation, from where the fit of a
 
 def in_forms(found: Iterable[Effect], *, exact: bool) -> list[Effect]:
     """Effects in the forms that a diagnosis tries; an `exact` simulation shows more."""
-    for forms in (_of_low_pass, _of_hysteresis, _of_resonance):
+    for forms in (_of_low_pass, _of_hysteresis, _of_dead_band, _of_resonance):
         found = [form for effect in found for form in forms(effect, exact=exact)]
     return [*found]
 
@@ -120,6 +121,29 @@ def _of_hysteresis(effect: Effect, *, exact: bool) -> list[Effect]:
     )
     of_part = f"share of h(t) and the rest of the ideal reading, h as {effect.equation}"
     return [whole, *([replace(effect, variant=SHARED, equation=of_part, starts=of_share)] if exact else [])]
+
+
+def _of_dead_band(effect: Effect, *, exact: bool) -> list[Effect]:
+    """A dead band whose faster readings are whole, and with `exact` a dead zone; another effect itself."""
+    if LOST not in effect.parameters:
+        return [effect]
+    starts = effect.starts
+    assert starts is not None, "a dead band has starts"
+    text = "gyro = omega where |omega| > width, else 0, on every axis"
+    whole = replace(
+        effect, equation=text, parameters=effect.parameters[:1], starts=lambda motion, at: [starts(motion, at)[0][:1]]
+    )
+    zone = replace(
+        effect,
+        equation="gyro = omega - width sign(omega) where |omega| > width, else 0, on every axis",
+        variant=ZONE,
+        constants=((LOST, LOST.plausible),),
+        parameters=effect.parameters[:1],
+        starts=lambda motion, at: [starts(motion, at)[1][:1]],
+        forward=lambda samples, theta: effect.forward(samples, np.append(theta, LOST.plausible)),
+        jumps=False,
+    )
+    return [whole, zone] if exact else [whole]
 
 
 def _of_resonance(effect: Effect, *, exact: bool) -> list[Effect]:

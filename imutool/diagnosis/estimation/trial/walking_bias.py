@@ -39,10 +39,10 @@ def squares_of_walk(found: Fit, like: Fit, *, of_any_speed: bool = False) -> flo
     """Squares that random walks of the biases explain of a fit's residual.
 
     They are twice the gain in log-likelihood, and what the fit itself did not reach; none of a sensor whose noise has its walk
-    already. `like` is the fit whose derivatives serve, with the same effects and perhaps more. What depends on time alone is
-    weighed against walks of any speed.
+    already. `like` is the fit whose derivatives serve, with the same effects and perhaps more. Against walks of any speed the
+    noise is what the samples scatter within half a second: all that is left would count a fast walk as noise.
     """
-    gained, noise = 0.0, max(1.0, like.reduced_chi_square)
+    gained = 0.0
     kept = [j for key in found.keys for j in range(*like.place(key).indices(len(like.prior)))]
     for k, log in enumerate(found.logs):
 
@@ -53,6 +53,7 @@ def squares_of_walk(found: Fit, like: Fit, *, of_any_speed: bool = False) -> flo
         for axes, steps, each in _walks(log, found.residuals[k], on_axis, of_any_speed=of_any_speed):
             if log.whiten.walk is not None and log.whiten.walk[axes].any():
                 continue
+            noise = max(1.0, max(one.within for one in each) if of_any_speed else like.reduced_chi_square)
             likely = sum((one.gain(noise) for one in each), start=np.zeros(len(steps)))
             gained += 2.0 * noise * float(likely[int(np.argmax(likely)) if of_any_speed else _likeliest(likely)])
     return gained
