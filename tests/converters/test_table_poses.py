@@ -489,3 +489,30 @@ def test_true_poses_in_the_imus_table_may_have_a_time_of_their_own(tmp_path, fir
     log = read(tmp_path)
     assert np.array_equal(log.imus["/imu0"].t_ns, 10_000_000 * np.arange(COUNT))
     np.testing.assert_allclose(log.poses["/ground_truth/pose"].t_ns, 1e9 * (T_S + 0.023), atol=1e3)
+
+
+def test_poses_of_ros_in_tables_are_on_the_stamps_of_their_headers(tmp_path):
+    """As bagpy and `rostopic echo -p` write them; the recorder's own time is 4 ms later."""
+    times_ns = [1e9 * T_S + 4e6, 1e9 * T_S]
+    for name, fields, values in (
+        ("imu", ("angular_velocity.{}", "linear_acceleration.{}"), (GYRO, ACCEL)),
+        ("vicon", ("pose.position.{}", "pose.orientation.{}"), (P_M, XYZW)),
+    ):
+        names = [f"field.{field.format(axis)}" for field in fields for axis in ("xyzw" if "orientation" in field else "xyz")]
+        header = ",".join(["%time", "field.header.stamp", *names])
+        (tmp_path / f"{name}.csv").write_text(f"{header}\n{rows(*times_ns, *values)}")
+    log = read(tmp_path)
+    np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL, atol=1e-6)
+    poses = log.poses["/ground_truth/pose"]
+    np.testing.assert_allclose(poses.t_ns, times_ns[1], atol=1.0)
+    np.testing.assert_allclose(poses.p_wb, P_M, atol=1e-8)
+
+
+@pytest.mark.parametrize(("other", "quaternion"), [("mag", "q"), ("gravity", "attitude.q")])
+def test_other_vectors_beside_an_orientation_are_no_positions(tmp_path, other, quaternion):
+    names = [f"{each}.{axis}" for each in ("gyro", "acc", other) for axis in "xyz"]
+    header = ",".join(["time", *names, *(f"{quaternion}{axis}" for axis in "xyzw")])
+    (tmp_path / "imu.csv").write_text(f"{header}\n{rows(T_S, GYRO, ACCEL, ACCEL / 9.80665, XYZW)}")
+    log = read(tmp_path / "imu.csv")
+    assert log.poses == {}
+    assert f"/{other}_x" in log.scalars
