@@ -264,6 +264,22 @@ def test_a_stated_unit_against_the_way_gravity_turns_is_doubted(tmp_path, named,
     assert any("gravity turns" in note and "is the unit right?" in note for note in notes) == doubted
 
 
+@pytest.mark.parametrize("written", ["rad", "deg"])
+def test_a_name_that_only_ros_has_in_rad_is_asked_where_gravity_turns_otherwise(tmp_path, written):
+    t_s = np.arange(3000) * 0.01
+    turn = Rotation.from_euler("xyz", 0.8 * np.sin(t_s[:, None] * [0.9, 1.3, 0.7]))
+    gyro = np.vstack([(turn[:-1].inv() * turn[1:]).as_rotvec() * 100.0, np.zeros(3)])
+    gyro = gyro + 0.002 * np.random.default_rng(3).normal(size=gyro.shape)
+    names = ["t", *(f"Angular Velocity {a}" for a in "XYZ"), *(f"Acceleration {a}" for a in "XYZ")]
+    values = [t_s, *(gyro if written == "rad" else np.degrees(gyro)).T, *turn.inv().apply([0.0, 0.0, 9.8]).T]
+    path = write_csv(tmp_path / "State.csv", names, values)
+    if written == "deg":
+        with pytest.raises(ConfigError, match="may be in rad/s, and gravity turns in the accelerometer as a gyro in deg/s says"):
+            read(path)
+    else:
+        np.testing.assert_allclose(read(path).imus["/imu0"].gyro, gyro, rtol=1e-9)
+
+
 @pytest.mark.parametrize(("unit", "doubted"), [("ms", True), ("s", False), ("us", True)])
 def test_a_stated_unit_of_the_time_that_gives_no_rate_of_an_imu_is_doubted(tmp_path, unit, doubted):
     """The header names another unit than the times have, which are of 100 Hz."""
