@@ -124,7 +124,12 @@ def _propose_stated(
         listed = ", ".join(chosen)
         proposal.reasons.append(f"{listed} state different units: {sensor}_scale = [x, y, z] in a map brings them to one")
     elif re.search(SI_WORDS, names[chosen[0]][0]):
-        proposal.entries[f"{sensor}_unit"] = next(iter(units))
+        unit = proposal.entries[f"{sensor}_unit"] = next(iter(units))
+        level, near = gravity_units(columns, chosen) if sensor == "accel" else (0.0, [])
+        if near and unit not in near:
+            proposal.open.append("accel_unit")
+            said = f"the median acceleration is {level:.4g}: gravity in {' or '.join(near)}"
+            proposal.reasons.append(f"by their names the columns may be in {unit}, and {said}")
     else:
         _propose_unit(proposal, sensor, columns)
 

@@ -280,6 +280,13 @@ def test_a_name_that_only_ros_has_in_rad_is_asked_where_gravity_turns_otherwise(
         np.testing.assert_allclose(read(path).imus["/imu0"].gyro, gyro, rtol=1e-9)
 
 
+def test_a_name_that_only_ros_has_in_si_units_is_asked_where_gravity_has_another_unit(tmp_path):
+    names = ["time", *(f"angular_velocity_{a}" for a in "xyz"), *(f"linear_acceleration_{a}" for a in "xyz")]
+    path = write_csv(tmp_path / "ros.csv", names, [T_S, *(COUNTS * 0.011).T, *ACCEL_G.T])
+    with pytest.raises(ConfigError, match=r"may be in m/s\^2, and the median acceleration is .*: gravity in g"):
+        read(path)
+
+
 @pytest.mark.parametrize(("unit", "doubted"), [("ms", True), ("s", False), ("us", True)])
 def test_a_stated_unit_of_the_time_that_gives_no_rate_of_an_imu_is_doubted(tmp_path, unit, doubted):
     """The header names another unit than the times have, which are of 100 Hz."""
