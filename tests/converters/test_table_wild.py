@@ -274,7 +274,9 @@ def test_a_name_that_only_ros_has_in_rad_is_asked_where_gravity_turns_otherwise(
     values = [t_s, *(gyro if written == "rad" else np.degrees(gyro)).T, *turn.inv().apply([0.0, 0.0, 9.8]).T]
     path = write_csv(tmp_path / "State.csv", names, values)
     if written == "deg":
-        with pytest.raises(ConfigError, match="may be in rad/s, and gravity turns in the accelerometer as a gyro in deg/s says"):
+        with pytest.raises(
+            ConfigError, match="may be in rad/s, and gravity turns in the accelerometer as a gyro in deg/s says"
+        ):
             read(path)
     else:
         np.testing.assert_allclose(read(path).imus["/imu0"].gyro, gyro, rtol=1e-9)
