@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 from pathlib import Path
 
 import numpy as np
@@ -570,6 +571,40 @@ def test_every_unit_at_the_end_of_a_name_has_a_meaning():
     found = [split_name(f"x_{unit}") for unit in (*rates, *times)]
     assert [name for name, _ in found] == ["x"] * len(found)
     assert {unit for _, unit in found} == {"deg/s", "rad/s", "s", "ns", "us", "ms"}
+
+
+@pytest.mark.parametrize("kind", ["lists", "arrays", "structures"])
+def test_vectors_in_a_cell_of_parquet_are_columns(tmp_path, kind):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    gyro = COUNTS * 0.011
+
+    def cells(values: np.ndarray) -> pa.Array:
+        if kind == "structures":
+            return pa.array([dict(zip("xyz", row, strict=True)) for row in values.tolist()])
+        return pa.array(values.tolist(), pa.list_(pa.float64(), 3 if kind == "arrays" else -1))
+
+    columns = {"time_s": T_S, "gyro": cells(gyro), "accel": cells(9.8 * ACCEL_G), "words": [[1.0], [1.0, 2.0]] * (COUNT // 2)}
+    pq.write_table(pa.table(columns), tmp_path / "run.parquet")
+    log = table.read_sequence(table.sequences(tmp_path / "run.parquet")[0], mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_array_equal(log.imus["/imu0"].gyro, gyro)
+    np.testing.assert_array_equal(log.imus["/imu0"].accel, 9.8 * ACCEL_G)
+    assert log.remarks.losses == ["words is left out: its lists differ in length, or are empty"]
+
+
+def test_rows_that_name_no_kind_are_of_one_of_their_own(tmp_path):
+    """As the true poses in the JSON lines of Spectacular AI, between rows that name their sensor."""
+    rows = []
+    for n, t in enumerate(T_S.tolist()):
+        rows += [{"time": t, "sensor": {"type": "gyroscope", "values": (COUNTS[n] * 0.011).tolist()}}]
+        rows += [{"time": t, "sensor": {"type": "accelerometer", "values": (9.8 * ACCEL_G[n]).tolist()}}]
+        pose = {"position": {"x": t, "y": 0, "z": 0}, "orientation": {"w": 1, "x": 0, "y": 0, "z": 0}}
+        rows += [{"time": t, "groundTruth": pose}] * (n % 20 == 0)
+    (tmp_path / "data.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    log = table.read_sequence(table.sequences(tmp_path / "data.jsonl")[0], mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_allclose(log.poses["/ground_truth/pose"].p_wb[:, 0], T_S[::20])
+    assert log.remarks.losses == []
 
 
 def test_objects_without_a_number_are_no_table(tmp_path):
