@@ -593,6 +593,21 @@ def test_vectors_in_a_cell_of_parquet_are_columns(tmp_path, kind):
     assert log.remarks.losses == ["words is left out: its lists differ in length, or are empty"]
 
 
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("mark", [",", "\t", " "])
+def test_rows_of_arduinos_serial_monitor_begin_with_the_time_of_their_arrival(tmp_path, mark, own):
+    """The board's own time counts before it."""
+    late = [f"15:04:{5 + n // 100:02d}.{n % 100:02d}{n % 7} -> " for n in range(COUNT)]
+    values = np.column_stack([*([1000 + np.arange(COUNT) * 10] if own else []), ACCEL_G, COUNTS * 0.07]).round(4)
+    rows = [arrived + mark.join(f"{value:g}" for value in row) for arrived, row in zip(late, values.tolist(), strict=True)]
+    header = "15:04:04.999 -> " + mark.join([*(["millis"] if own else []), *NAMES[1:]])
+    (tmp_path / "monitor.txt").write_text("\n".join(["15:04:01.000 -> MPU ready", header, *rows]) + "\n")
+    imu = read(tmp_path / "monitor.txt").imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, np.deg2rad((COUNTS * 0.07).round(4)), rtol=1e-5)
+    assert imu.t_ns[0] == (10**9 if own else (15 * 3600 + 4 * 60 + 5) * 10**9)
+    assert (np.diff(imu.t_ns) == 10_000_000).all() == own
+
+
 def test_rows_that_name_no_kind_are_of_one_of_their_own(tmp_path):
     """As the true poses in the JSON lines of Spectacular AI, between rows that name their sensor."""
     rows = []
