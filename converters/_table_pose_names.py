@@ -40,10 +40,10 @@ NUMBERS = "012345678", "123456789"
 
 
 def pose_leaves(columns: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Owner and name of columns in their groups; the name of axes alone begins with that of their group.
+    """Owner and name of columns in their groups.
 
-    `pose.position.x` is `position_x` of `pose`, a magnetometer `mag.x` is no position, and the `x` of a body with `qw` is one.
-    Columns of other groups have no owner.
+    The name of axes alone begins with that of their group: `pose.position.x` is `position_x` of `pose`. So a magnetometer
+    `mag.x` is no position, and the `x` of a body with `qw` is one. Columns of other groups have no owner.
     """
     leaves = {column: split_name(leaf_of(column))[0] for column in columns}
     beside: dict[str, set[str]] = {}
