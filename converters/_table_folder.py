@@ -27,6 +27,7 @@ from ._table_geodetic import add_local
 from ._table_header import MOSTLY
 from ._table_look import look, recorded_apart
 from ._table_map import POSES_GROUP, TRUTH_GROUP
+from ._table_merged import join_positions
 from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_packed import read_bytes, table_name
 from ._table_roles import POSES, Names, role_folders, role_groups, shared_names, without_role
@@ -133,6 +134,7 @@ def load_split(folder: Path, recording: str = "") -> Columns:
         if group == TRUTH_GROUP:
             add_local(part)
         whole.take(group, part, path.name)
+    join_positions(whole)
     return whole
 
 

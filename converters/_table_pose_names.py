@@ -58,7 +58,7 @@ def pose_leaves(columns: Iterable[str]) -> dict[str, tuple[str, str]]:
 def has_poses(columns: Columns) -> bool:
     """Whether a table has positions and quaternions, matrices or angles, in whatever order."""
     leaves = {leaf: column for column, (_, leaf) in pose_leaves(columns.values).items()}
-    return _has_turns(leaves) and bool(position_of(leaves))
+    return has_turns(leaves) and bool(position_of(leaves))
 
 
 def why_no_poses(columns: Columns, group: str) -> str:
@@ -68,13 +68,14 @@ def why_no_poses(columns: Columns, group: str) -> str:
         return note
     own = {name.removeprefix(f"{group}/"): name for name in columns.values if name.startswith(f"{group}/")}
     leaves = {leaf: own[name] for name, (_, leaf) in pose_leaves(own).items()}
-    if position_of(leaves) and not _has_turns(leaves):
+    if position_of(leaves) and not has_turns(leaves):
         return "it has positions without orientations, and imutool uses no positions alone; its columns are topics of the log"
     said = "no time with positions and rotations of a certain order was found in it"
     return f"{said}; a map names its columns (truth_time, position, quaternion_wxyz or another rotation)"
 
 
-def _has_turns(leaves: dict[str, str]) -> bool:
+def has_turns(leaves: dict[str, str]) -> bool:
+    """Whether there are quaternions, matrices or angles."""
     quaternion = axes_of(QUATERNION, leaves, "wxyz") or axes_of(QUATERNION_ARRAY, leaves, "0123")
     return bool(quaternion or matrix_of(leaves) or angles_of(leaves))
 

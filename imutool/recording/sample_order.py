@@ -161,8 +161,8 @@ class Ticked(NamedTuple):
 def ticked(t_ns: Int64[np.ndarray, " n"], before: Ticked | None = None) -> Ticked | None:
     """Even clock behind stamps in coarse ticks; None of others.
 
-    Its steps alternate, as 1, 1, 1 and 2 ms at 800 Hz. Samples that are lost by chance make no such clock: the shorter quarter of the spans of 256 samples differ by more ticks.
-    Of stamps too few to show it, it is the clock `before` them.
+    Its steps alternate, as 1, 1, 1 and 2 ms at 800 Hz. Samples that are lost by chance make no such clock: the shorter quarter
+    of the spans of 256 samples differ by more ticks. Of stamps too few to show it, it is the clock `before` them.
     """
     if len(t_ns) < 2 * TICK_SPAN:
         return before

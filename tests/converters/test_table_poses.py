@@ -516,3 +516,20 @@ def test_other_vectors_beside_an_orientation_are_no_positions(tmp_path, other, q
     log = read(tmp_path / "imu.csv")
     assert log.poses == {}
     assert f"/{other}_x" in log.scalars
+
+
+@pytest.mark.parametrize(
+    ("names", "kind"), [(("attitude", "position"), "estimate"), (("gt_orientation", "gt_position"), "truth")]
+)
+def test_orientations_and_positions_in_two_tables_are_poses_together(tmp_path, names, kind):
+    (tmp_path / "imu.csv").write_text(imu_text())
+    (tmp_path / f"{names[0]}.csv").write_text("time [s],qx,qy,qz,qw\n" + rows(T_S + 0.003, XYZW))
+    gap = np.r_[np.arange(0, 700, 5), np.arange(800, COUNT, 5)]
+    (tmp_path / f"{names[1]}.csv").write_text("time [s],x,y,z\n" + rows(T_S[gap], P_M[gap]))
+    log = read(tmp_path)
+    ((topic, poses),) = log.poses.items()
+    assert log.kinds[topic] == kind
+    t_s = 1e-9 * poses.t_ns
+    assert len(t_s) == pytest.approx(COUNT - 105, abs=10)  # without the gap, across which nothing is interpolated
+    assert ((t_s < 6.96) | (t_s > 7.99)).all()
+    np.testing.assert_allclose(poses.p_wb, np.sin(t_s[:, None] * [0.5, 0.8, 1.1]), atol=1e-3)
