@@ -404,6 +404,21 @@ def test_a_wider_table_without_header_gets_a_guess_to_confirm(tmp_path):
     assert '# perhaps gyro = ["column 5", "column 6", "column 7"]' in str(caught.value)
 
 
+def test_the_motion_shows_which_columns_of_a_wide_table_are_the_imu(tmp_path):
+    """As KAIST's xsens_imu.csv: time, quaternion, angles, gyro, accelerometer, magnetometer."""
+    t_s = np.arange(3000) * 0.01
+    turn = Rotation.from_euler("xyz", 0.8 * np.sin(t_s[:, None] * [0.9, 1.3, 0.7]))
+    noise = np.random.default_rng(3).normal(0.0, 0.002, (4, 3000, 3))
+    gyro = np.vstack([(turn[:-1].inv() * turn[1:]).as_rotvec() * 100.0, np.zeros(3)])
+    sensors = [gyro + noise[0], turn.inv().apply([0.0, 0.0, 9.8]) + noise[1], turn.inv().apply([0.2, 0.0, -0.4]) + noise[2]]
+    rows = np.column_stack([t_s, turn.as_quat(), turn.as_euler("xyz"), *sensors])
+    (tmp_path / "imu.csv").write_text("\n".join(",".join(map(repr, row)) for row in rows.tolist()) + "\n")
+    with pytest.raises(ConfigError) as caught:
+        read(tmp_path / "imu.csv")
+    assert '# perhaps accel = ["column 12", "column 13", "column 14"]' in str(caught.value)
+    assert '# perhaps gyro = ["column 9", "column 10", "column 11"]' in str(caught.value)
+
+
 def test_axes_in_letters_come_before_numbered_columns_of_the_same_word(tmp_path):
     names = ["t_ms", *NAMES[1:], "a0", "a1", "a2"]
     columns = [1e3 * T_S, *ACCEL_G.T, *(COUNTS * 0.07).T, *RNG.normal(600, 9, (3, COUNT))]
