@@ -83,7 +83,7 @@ def recording(
         if repeated:
             notes["imutool/repairs"][truths[folder]] = REPEATED.format(repeated)
     mounts = [_mount(content.get(f"{folder}/sensor.yaml", b"")) for folder in (IMU, *folders[:1])]
-    if len(mounts) > 1 and not np.allclose(*mounts, atol=MOUNT_TOLERANCE):
+    if len(mounts) > 1 and not np.allclose(mounts[0], mounts[1], atol=MOUNT_TOLERANCE):
         notes["imutool/skipped"][f"{IMU}/sensor.yaml"] = MOUNTED
     frames = {}
     for camera, name in lists.items():

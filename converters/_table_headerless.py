@@ -10,7 +10,6 @@ import json
 import re
 from collections import Counter
 from itertools import pairwise, product
-from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,7 +36,6 @@ LEAST_ROWS, LEAST_SHARE = 5, 0.3  # of the lines looked at that have the same wo
 LEAST_TENTH = 0.5  # of the median length, which 90 % of an accelerometer's readings exceed
 LEAST_NUMBERS, LEAST_LABELS = 4, 2  # in a row
 WIDE, MOST_ROWS = 7, 20_000  # more columns than a time and an IMU; rows that are compared
-first_of = itemgetter(0)
 LONGEST_LINE, LONGEST_LABEL = 2_000, 80  # characters; the search for labels costs the square of their length
 NUMBER = re.compile(
     r"(?<![\w.^/])(\d{4}-\d\d-\d\d[T ]\d\d?:\d\d:\d\d(?:[.,]\d+)?Z?|\d\d?:\d\d:\d\d(?:[.,]\d+)?"
@@ -118,15 +116,14 @@ def _turning(columns: Columns, names: list[str]) -> _Halves | None:
     sizes = [np.linalg.norm([values[name] for name in three], axis=0) for three in triples]
     accels = [three for three, size in zip(triples, sizes, strict=True) if _has_gravity(columns, three) and np.ptp(size) > 1e-3]
     t_ns = np.rint((t - t[0]) * TIME_NS[units[0]]).astype(np.int64)[:MOST_ROWS]
-    best: tuple[float, _Halves | None] = 0.0, None
+    best, surest = None, 0.0
     for accel, gyro in product(accels, triples):
         if not {*accel} & {*gyro} and (np.diff(t_ns) > 0).all():
-            sides = (np.stack([values[name] for name in three], axis=1) for three in (gyro, accel))
-            found = unit_by_gravity(t_ns, *sides, GYRO_SI)
-            best = max(
-                best, (found[1], _Halves(names[:1], [*accel, *gyro], ("accel", "gyro"))) if found else best, key=first_of
-            )
-    return best[1]
+            rates, forces = (np.stack([values[name] for name in three], axis=1) for three in (gyro, accel))
+            found = unit_by_gravity(t_ns, rates, forces, GYRO_SI)
+            if found and found[1] > surest:
+                best, surest = _Halves(names[:1], [*accel, *gyro], ("accel", "gyro")), found[1]
+    return best
 
 
 def _has_gravity(columns: Columns, triple: list[str], factor: float = 1.0) -> bool:

@@ -25,7 +25,9 @@ POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (POSITION, "xyz"),
     (r"(p(os(ition)?)?_?)?(?P<axis>east|north|up)", ("east", "north", "up")),
     (rf"(p(os(ition)?)?_?|{LOCAL})?(?P<axis>north|east|down)", ("north", "east", "down")),
-    (r"p_?(?P<axis>[ned])", "ned"),
+    (r"p(os(ition)?)?_?(?P<axis>[ned])", "ned"),
+    (r"(p(os(ition)?)?_?)?ned_?(?P<axis>[xyz])", "xyz"),
+    (r"(p(os(ition)?)?_?)?(?P<axis>[xyz])_?ned", "xyz"),
 )
 NED = POSITIONS[2:]
 MATRIX = rf"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r|c){FRAMES}_?(?P<axis>[0-3][0-3]|\d)"  # or Rot[8]

@@ -533,3 +533,14 @@ def test_orientations_and_positions_in_two_tables_are_poses_together(tmp_path, n
     assert len(t_s) == pytest.approx(COUNT - 105, abs=10)  # without the gap, across which nothing is interpolated
     assert ((t_s < 6.96) | (t_s > 7.99)).all()
     np.testing.assert_allclose(poses.p_wb, np.sin(t_s[:, None] * [0.5, 0.8, 1.1]), atol=1e-3)
+
+
+@pytest.mark.parametrize("names", ["x_ned,y_ned,z_ned", "pos_ned_x,pos_ned_y,pos_ned_z", "pos_n,pos_e,pos_d"])
+def test_positions_whose_names_say_ned_are_turned_to_a_world_with_z_up(tmp_path, names):
+    (tmp_path / "imu.csv").write_text(imu_text())
+    to_ned = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+    poses = rows(T_S, to_ned.apply(P_M), (to_ned * TURN).as_quat())
+    (tmp_path / "groundtruth.csv").write_text(f"time [s],{names},qx,qy,qz,qw\n{poses}")
+    true = read(tmp_path).poses["/ground_truth/pose"]
+    np.testing.assert_allclose(true.p_wb, P_M, atol=1e-8)
+    np.testing.assert_allclose(Rotation.from_quat(true.q_wb_wxyz, scalar_first=True).as_matrix(), MATRICES, atol=1e-6)

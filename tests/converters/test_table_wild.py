@@ -130,6 +130,7 @@ def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
         ([f"w_{a} [deg/s]" for a in "xyz"], [f"f_{a}" for a in "xyz"]),
         ([f"gyr_left_wrist_{a}_dps" for a in "xyz"], [f"acc_left_wrist_{a}" for a in "xyz"]),
         ([f"Gyro{a}_chest (deg/s)" for a in "XYZ"], [f"Accel{a}_chest" for a in "XYZ"]),
+        ([f"Foot Gyroscope {a} [deg/s]" for a in "XYZ"], [f"Foot Accel Sensor {a} [m/s^2]" for a in "XYZ"]),  # Noraxon
         (["p [deg/s]", "q [deg/s]", "r [deg/s]"], [f"accl{k}" for k in range(3)]),
         ([f"flight.{a} [deg/s]" for a in "pqr"], [f"flight.f_{a}" for a in "xyz"]),  # of a structure, or of a folder's table
         ([f"gyro_deg_s[{k}]" for k in range(3)], [f"accelerometer_m_s2[{k}]" for k in range(3)]),
