@@ -6,12 +6,14 @@ metadata record `imutool/repairs`. Nothing of the IMU is ever repaired: a defect
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from functools import partial
 from pathlib import PurePosixPath
 
 import numpy as np
 
+from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars, unit_quaternions
 
@@ -22,9 +24,14 @@ IMU = "imu0"
 IMU_TOPIC = "/imu0"
 QUATERNION_TOLERANCE = 1e-2  # printed with six decimals the norm is off by 3e-4 at most in EuRoC; more is not a rotation
 REPEATED = "{} poses with a repeated stamp dropped, the first kept"
+MOUNT_TOLERANCE = 1e-3  # m, and of a rotation's matrix
 OF_DATASETS = "leica", "pointcloud", "vicon"  # sensors that EuRoC's folders have beside IMU, poses and cameras
 NO_POSES = "not read: holds no full poses"
 OTHER_SENSOR = f"is left out: of such a folder {IMU}, poses and cameras are read; its data.csv can be converted by itself"
+MOUNTED = (
+    "its T_BS is not that of the poses, and moves neither; imutool convert LOG OUT --fix turns the poses to the IMU's axes"
+)
+T_BS = re.compile(rb"T_BS:.*?data:\s*\[([^\]]*)\]", re.DOTALL)  # pose of a sensor on the body, in its sensor.yaml
 IMAGE_FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 
 
@@ -75,6 +82,9 @@ def recording(
         repeated = add_truth(table, truths[folder], poses, scalars)
         if repeated:
             notes["imutool/repairs"][truths[folder]] = REPEATED.format(repeated)
+    mounts = [_mount(content.get(f"{folder}/sensor.yaml", b"")) for folder in (IMU, *folders[:1])]
+    if len(mounts) > 1 and not np.allclose(mounts[0], mounts[1], atol=MOUNT_TOLERANCE):
+        notes["imutool/skipped"][f"{IMU}/sensor.yaml"] = MOUNTED
     frames = {}
     for camera, name in lists.items():
         found = _frames(tree, camera, content[name])
@@ -88,6 +98,16 @@ def recording(
             notes["imutool/skipped" if of_dataset else "imutool/losses"][other] = NO_POSES if of_dataset else OTHER_SENSOR
     metadata.update({name: note for name, note in notes.items() if note})
     return Recording(sequence.name, samples, poses, scalars, frames, metadata, IMU_TOPIC, sequence.path.name)
+
+
+def _mount(settings: bytes) -> Float64[np.ndarray, "16"]:
+    """Pose of a sensor on the body as its settings state it, row by row; the identity where they do not."""
+    match = T_BS.search(settings)
+    try:
+        numbers = np.array([float(number) for number in match[1].split(b",")]) if match else np.zeros(0)
+    except ValueError:
+        numbers = np.zeros(0)
+    return numbers if len(numbers) == 16 else np.eye(4).reshape(-1)
 
 
 def imu(table: _table.Table) -> Imu:

@@ -57,7 +57,7 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
         found.sort(key=lambda c: not re.match(OWN_TIME["gyro"], spelled[c][1]))
     found.sort(key=lambda c: re.match(rf"{TRUE_GROUPS}_", names[c][0]) is not None)
     found = _steadiest_first(found, spelled, columns, proposal)
-    found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
+    found.sort(key=lambda c: not names[c][0].endswith("header_stamp"))
     shown = (proposal.unsigned("accel", columns) or [*names])[:1]
     counters = counters_of(columns, length or len(columns.values[shown[0]]) if shown else 0)
     if not found:

@@ -35,6 +35,7 @@ DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset;
 )
 MONTHS = "jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"
 NAMED = re.compile(rf"(\d\d?)[- ]({'|'.join(MONTHS)})[- ](\d{{4}})(?=[ T])", re.IGNORECASE)  # 21-Nov-2026 15:04:05, of MATLAB
+COMPACT = re.compile(r"(\d{4})(\d\d)(\d\d)[T_ -](\d\d):?(\d\d):?(\d\d)(?!\d)")  # 20261121T150405.123
 CLOCK = re.compile(  # of one day or, as Excel shows times, of one hour; 15:04:05:123 ends with milliseconds
     r"(?:(\d\d?):)?(\d\d?):(\d\d)(?:(?:[.,]|(?<=:\d\d:\d\d):(?=\d{3}$))(\d{1,9})\d*)?"
 )
@@ -47,6 +48,8 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
     """
     if texts and NAMED.match(texts[0]):
         texts = [NAMED.sub(lambda m: f"{m[3]}-{MONTHS.index(m[2].lower()) + 1}-{m[1]}", text) for text in texts]
+    if texts and COMPACT.match(texts[0]):
+        texts = [COMPACT.sub(r"\1-\2-\3T\4:\5:\6", text, count=1) for text in texts]
     matches = [DATE.fullmatch(text) for text in texts]
     slashes = [match for match in matches if match and match["sign"] == "/"]
     day_first = any(int(match["first"]) > 12 for match in slashes)
@@ -91,6 +94,28 @@ def clock_of_numbers(values: np.ndarray) -> Int64[np.ndarray, " n"] | None:
         steps, ends = np.diff(t_ns), np.diff(minutes) != 0
         if ends.any() and steps.min() >= 0 and steps[ends].min() < LONGEST_END_NS and steps.mean() < LONGEST_STEP_NS:
             return t_ns
+    return None
+
+
+def dates_of_numbers(values: np.ndarray) -> Int64[np.ndarray, " n"] | None:
+    """Nanoseconds since 1970 of whole numbers yyyymmddhhmmss; None for others.
+
+    Parts of the second may stand behind.
+    """
+    for parts in PARTS_OF_SECOND if values.dtype.kind in "iu" and len(values) else ():
+        days, clocks = np.divmod(values, 10**6 * parts)
+        seconds, minutes, hours = clocks % (100 * parts), clocks // (100 * parts) % 100, clocks // (10_000 * parts)
+        fits = (days >= 1970_01_01) & (days < 2262_01_01) & (hours < 24) & (minutes < 60) & (seconds < 60 * parts)
+        if not fits.all():
+            continue
+        named, place = np.unique(days, return_inverse=True)
+        try:
+            dates = [np.datetime64(f"{day // 10_000}-{day // 100 % 100:02d}-{day % 100:02d}", "ns") for day in named.tolist()]
+        except ValueError:  # 20261340
+            continue
+        of_day = (hours * 3600 + minutes * 60) * 10**9 + seconds * (10**9 // parts)
+        t_ns: Int64[np.ndarray, " n"] = np.array(dates).astype(np.int64)[place] + of_day
+        return t_ns
     return None
 
 

@@ -42,6 +42,8 @@ MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own
 MAT = (b"\x00\x01IM", b"\x01\x00MI")  # version 5 and the order of bytes, behind a text that is the writing program's own
 MAT_AT = slice(124, 128)
 ZIP = b"PK\x03\x04"
+NUMBERS = r"u?int|float|double|halffloat|bool|timestamp|duration|dict"  # names of types of Arrow
+VECTORS = r"(large_|fixed_size_)?list<\w+: (u?int|float|double|halffloat)"
 SHEETS = {"xl/workbook.xml": "sheets", "xl/workbook.bin": "other sheets", "content.xml": "other sheets"}  # members of a zip
 
 
@@ -152,7 +154,9 @@ def read_text(text: str, columns: Columns, path: Path) -> None:
 def _load_parquet(path: Path, columns: Columns) -> None:
     file = _module("pyarrow.parquet", path).ParquetFile(path)
     names = _numbers_of(file.schema_arrow, columns)
-    check_size(path, file.metadata.num_rows * len(names) * 8)
+    groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
+    each = (group.column(number) for group in groups for number in range(group.num_columns))
+    check_size(path, 8 * sum(column.num_values for column in each if column.path_in_schema.partition(".")[0] in names))
     _add_arrow(file.read(columns=names), columns)  # a text of a few bytes may unpack to gigabytes
 
 
@@ -169,8 +173,8 @@ def _load_feather(path: Path, columns: Columns) -> None:
 
 
 def _numbers_of(schema: Any, columns: Columns) -> list[str]:
-    """Names of the fields that hold numbers or times; the others are losses."""
-    numbers = [f.name for f in schema if re.match(r"u?int|float|double|halffloat|bool|timestamp|duration|dict", str(f.type))]
+    """Names of the fields that hold numbers or times, also in lists and structures; the others are losses."""
+    numbers = [f.name for f in schema if re.match(rf"{NUMBERS}|{VECTORS}|struct", str(f.type))]
     words = [f.name for f in schema if re.match(r"large_string|string", str(f.type)) and tells_apart(f.name)]
     others = [field for field in schema if field.name not in (*numbers, *words)]
     columns.remarks.losses.extend(f"{field.name} is left out: it is of type {field.type}, no number" for field in others)
@@ -178,8 +182,23 @@ def _numbers_of(schema: Any, columns: Columns) -> list[str]:
 
 
 def _add_arrow(table: Any, columns: Columns) -> None:
+    while any(str(field.type).startswith("struct") for field in table.schema):
+        table = table.flatten()  # `header.stamp.sec`
     for name in table.column_names:
         column = table.column(name)
+        if "." in name and not re.match(rf"{NUMBERS}|{VECTORS}", str(column.type)):
+            columns.remarks.losses.append(f"{name} is left out: it is of type {column.type}, no number")
+            continue
+        if re.match(VECTORS, str(column.type)):
+            import pyarrow.compute
+
+            lists = column.combine_chunks()
+            lengths = np.unique(pyarrow.compute.list_value_length(lists).fill_null(0).to_numpy(zero_copy_only=False))
+            if len(lengths) == 1 and lengths[0] > 0:
+                columns.add(name, lists.flatten().to_numpy(zero_copy_only=False).reshape(-1, int(lengths[0])))
+            else:
+                columns.remarks.losses.append(f"{name} is left out: its lists differ in length, or are empty")
+            continue
         if times := re.match("timestamp|duration", str(column.type)):
             columns.add(f"{name} [ns]", column.cast(f"{times[0]}[ns]").cast("int64").to_numpy())
         elif "string" in str(column.type):

@@ -27,10 +27,11 @@ from ._table_geodetic import add_local
 from ._table_header import MOSTLY
 from ._table_look import look, recorded_apart
 from ._table_map import POSES_GROUP, TRUTH_GROUP
+from ._table_merged import join_positions
 from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_packed import read_bytes, table_name
-from ._table_roles import Names, role_folders, role_groups, shared_names, without_role
-from ._table_sensors import SENSORS, name_columns, sensors_among
+from ._table_roles import POSES, Names, role_folders, role_groups, shared_names, without_role
+from ._table_sensors import SENSORS, SPACED, name_columns, sensors_among
 from ._table_text import LOOKED_AT, Columns, is_text_table, read_csv, text_of
 from ._table_times import rises
 from .px4_csv import logs_in
@@ -63,14 +64,26 @@ ENDINGS = (
 def sequences_below(source: Path) -> list[Sequence]:
     """Recordings of tables in a folder and in those below it."""
     found: dict[Path, list[Sequence]] = {}
+    parts = set[Path]()
 
     def is_mine(folder: Path) -> bool:
         above = next((each for each in folder.parents if found.get(each)), folder)
         is_part = any(each in (folder, *folder.parents) for each in role_folders(above))
+        parts.update([folder] if is_part else [])
         return bool(found.setdefault(folder, [] if is_part else _sequences_in(folder)))
 
     find_folders(source, is_mine, lambda folder: found[folder][0].path.is_dir())  # whose folders may be sensors of it
-    return [*chain(*found.values())]
+    sequences = [*chain(*found.values())]
+    others = [folder for folder, own in found.items() if sequences and not own and folder not in parts]
+    names = ((path.parent, re.sub(SPACED, "_", path.parent.name).lower(), path) for each in others for path in _tables(each))
+    if true := [f"{folder.name}/{path.name}" for folder, name, path in names if re.fullmatch(POSES, name)]:
+        said = f"tables of true poses in a folder without an IMU are left out: {_listed(true)}"
+        logger.warning("%s: %s. Put each beside the tables of its IMU, with ground_truth in its name", source, said)
+    return sequences
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
 
 
 def _sequences_in(folder: Path) -> list[Sequence]:
@@ -85,10 +98,12 @@ def _sequences_in(folder: Path) -> list[Sequence]:
     found = {} if is_phone(folder) or logs_in(folder) else _recordings(folder)
     used = {path for tables in found.values() for path in tables}
     others = {path: kind_of(head(path), path) for path in _tables(folder) if path.is_file() and path not in used}
-    left = [path.name for path, kind in others.items() if kind in ("csv", "") or (kind != "json" and look(path).header)]
+    shown = (
+        kind in ("csv", "") or (kind != "json" and (look(path).header or look(path).has_time)) for path, kind in others.items()
+    )
+    left = [path.name for path, is_table in zip(others, shown, strict=True) if is_table]
     if found and left:  # settings in JSON are none, and damaged ones are told of
-        more = f" and {len(left) - MOST_NAMED} more" if len(left) > MOST_NAMED else ""
-        logger.warning("%s: tables that show no IMU are left out: %s%s", folder, ", ".join(left[:MOST_NAMED]), more)
+        logger.warning("%s: tables that show no IMU are left out: %s", folder, _listed(left))
     places = {name: (next(iter(tables)), "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
     return [Sequence(folder.name if len(found) == 1 else name, *place) for name, place in places.items()]
 
@@ -119,6 +134,7 @@ def load_split(folder: Path, recording: str = "") -> Columns:
         if group == TRUTH_GROUP:
             add_local(part)
         whole.take(group, part, path.name)
+    join_positions(whole)
     return whole
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import chain
 
@@ -21,6 +21,7 @@ from ._table_pose_names import (
     axes_of,
     bodies_of,
     matrix_of,
+    pose_leaves,
     position_of,
 )
 from ._table_rotations import EITHER_WAY, TURNS, angles_by_motion, matrix_by_motion, order_by_motion, seconds_of
@@ -83,18 +84,11 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     """
     time, unit = str(entries["time"]), str(entries["time_unit"])
     other = time_beside(columns, columns.unsigned(entries["accel"][0]), time, unit, apart=True)
-    found: Entries = {"accel_time": other[0]} if other is not None and other[1] == unit else {}
+    own = time_beside(columns, columns.unsigned(entries["gyro"][0]), time, unit, apart=True)
+    found: Entries = {"accel_time": other[0]} if other is not None and other[1] == unit and other != own else {}
     found |= _position_beside(columns, entries)
-    groups: dict[tuple[tuple[str, str], bool], dict[str, str]] = {}
-    for column, values in columns.values.items():
-        in_rows = (time, unit) if len(values) == len(columns.values[time]) else None
-        beside = time_beside(columns, column, time, unit, apart=True) or in_rows
-        if beside is not None and not entries.keys() & TURNS:
-            leaf = split_name(column.removeprefix(group_of(column)))[0]
-            name = re.sub(rf"^{TRUE_GROUPS}_", "", leaf)
-            groups.setdefault((beside, is_true(column) or name != leaf), {})[name] = column
     poses = []
-    for (shared, named_true), leaves in groups.items():
+    for shared, named_true, leaves in () if entries.keys() & TURNS else _bodies(columns, time, unit):
         clock = (named_true and shared[0] == time and _own_time(columns, leaves, time, unit)) or shared
         bodies = bodies_of(leaves)
         for body in (leaves, *bodies):
@@ -118,6 +112,20 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
             found["pose_world"] = "ned"
             reasons.append(f"{', '.join(named)} are north, east and down: the poses are turned to east, north, up")
     return found
+
+
+def _bodies(columns: Columns, time: str, unit: str) -> Iterator[tuple[tuple[str, str], bool, dict[str, str]]]:
+    """Clock of columns that may be poses, whether they are named as true, and their names; those of each owner apart."""
+    groups: dict[tuple[tuple[str, str], bool], dict[str, dict[str, str]]] = {}
+    for column, (owner, leaf) in pose_leaves(columns.values).items():
+        in_rows = (time, unit) if len(columns.values[column]) == len(columns.values[time]) else None
+        beside = time_beside(columns, column, time, unit, apart=True) or in_rows
+        if beside is not None:
+            name = re.sub(rf"^{TRUE_GROUPS}_", "", leaf)
+            groups.setdefault((beside, is_true(column) or name != leaf), {}).setdefault(owner, {})[name] = column
+    for (clock, named_true), owners in groups.items():
+        plain = owners.pop("", {})
+        yield from ((clock, named_true, plain | each) for each in owners.values() or [plain])
 
 
 def _own_time(columns: Columns, leaves: dict[str, str], time: str, unit: str) -> tuple[str, str] | None:
@@ -221,8 +229,9 @@ def time_beside(columns: Columns, column: str, time: str, unit: str, *, apart: b
         return None
     group, found = group_of(column), list[str]()
     while group and not found:
-        long = {c: values for c, values in columns.values.items() if group_of(c) == group and len(values) == length}
-        rising = [c for c, values in long.items() if goes_on(values)]
+        long = {c: group_of(c) for c, values in columns.values.items() if len(values) == length}
+        headers = [f"{group}/header", f"{group}.header"]  # of ROS, whose stamps count before the time of the recorder
+        rising = [c for each in (*headers, group) for c, of in long.items() if of == each and goes_on(columns.values[c])]
         longer = rf"(.*_)?{TIME_WORDS}|time_?stamp_.*"  # imuTimestamp, timestamp_global
         found = list(filter(is_time, rising)) or [c for c in rising if re.fullmatch(longer, spaced_name(leaf_of(c)))]
         group = group_of(group)

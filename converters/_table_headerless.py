@@ -9,15 +9,17 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from imutool.recording.joined_imu import unit_by_gravity
+
 from ._table_names import unit_named
 from ._table_text import Columns
-from ._table_times import rises
-from ._table_units import gravity_units
+from ._table_times import rises, units_of_time, usual_step
+from ._table_units import GYRO_SI, TIME_NS, gravity_units
 
 SQUARE = [f"[{number}]" for number in range(9)]
 ROS_IMU = [  # `ros2 topic echo --csv` of sensor_msgs/Imu
@@ -33,6 +35,7 @@ LOOKED_AT = 200  # first lines, which show the words between the numbers
 LEAST_ROWS, LEAST_SHARE = 5, 0.3  # of the lines looked at that have the same words; status lines may stand between
 LEAST_TENTH = 0.5  # of the median length, which 90 % of an accelerometer's readings exceed
 LEAST_NUMBERS, LEAST_LABELS = 4, 2  # in a row
+WIDE, MOST_ROWS = 7, 20_000  # more columns than a time and an IMU; rows that are compared
 LONGEST_LINE, LONGEST_LABEL = 2_000, 80  # characters; the search for labels costs the square of their length
 NUMBER = re.compile(
     r"(?<![\w.^/])(\d{4}-\d\d-\d\d[T ]\d\d?:\d\d:\d\d(?:[.,]\d+)?Z?|\d\d?:\d\d:\d\d(?:[.,]\d+)?"
@@ -65,7 +68,9 @@ def perhaps(columns: Columns) -> list[str]:
     for names in groups.values():  # a number of a frame, which does not rise in each row, is no time
         if (first := columns.values[names[0]]).dtype.kind in "iu" and not rises(first) and (np.diff(first) >= 0).all():
             del names[0]
-    halves = next(filter(None, (_halves(columns, names) for names in groups.values())), None)
+    wide = [names for names in groups.values() if len(names) > WIDE]
+    halves = next(filter(None, (_turning(columns, names) for names in wide)), None)
+    halves = halves or next(filter(None, (_halves(columns, names) for names in groups.values())), None)
     if halves is None:
         return []
     triples = zip(halves.sensors, (halves.columns[:3], halves.columns[3:]), strict=True)
@@ -95,6 +100,30 @@ def _halves(columns: Columns, names: list[str]) -> _Halves | None:
         rate_hz = 1.0 / float(np.nanmedian(np.diff(columns.values[time[0]].astype(float))))
         shows = [_has_gravity(columns, half, rate_hz) for half in (six[:3], six[3:])]
     return _Halves(time, six, ("accel", "gyro") if shows[0] else ("gyro", "accel")) if sum(shows) == 1 else None
+
+
+def _turning(columns: Columns, names: list[str]) -> _Halves | None:
+    """Three columns of a wide table in which gravity turns as a gyro in three others says; None of other tables.
+
+    A direction has the same length in each row, and is none that a sensor measures.
+    """
+    t = columns.values[names[0]].astype(float)
+    units = units_of_time(float(t[0]), usual_step(t)) if rises(columns.values[names[0]]) else []
+    if len(units) != 1:
+        return None
+    values = {name: columns.values[name].astype(float)[:MOST_ROWS] for name in names[1:]}
+    triples = [[*names[first : first + 3]] for first in range(1, len(names) - 2)]
+    sizes = [np.linalg.norm([values[name] for name in three], axis=0) for three in triples]
+    accels = [three for three, size in zip(triples, sizes, strict=True) if _has_gravity(columns, three) and np.ptp(size) > 1e-3]
+    t_ns = np.rint((t - t[0]) * TIME_NS[units[0]]).astype(np.int64)[:MOST_ROWS]
+    best, surest = None, 0.0
+    for accel, gyro in product(accels, triples):
+        if not {*accel} & {*gyro} and (np.diff(t_ns) > 0).all():
+            rates, forces = (np.stack([values[name] for name in three], axis=1) for three in (gyro, accel))
+            found = unit_by_gravity(t_ns, rates, forces, GYRO_SI)
+            if found and found[1] > surest:
+                best, surest = _Halves(names[:1], [*accel, *gyro], ("accel", "gyro")), found[1]
+    return best
 
 
 def _has_gravity(columns: Columns, triple: list[str], factor: float = 1.0) -> bool:

@@ -17,7 +17,7 @@ from ._table_headerless import perhaps
 from ._table_layouts import known_layout
 from ._table_mocap import is_mocap
 from ._table_packed import opener, text_head
-from ._table_pose_names import has_poses
+from ._table_pose_names import has_poses, has_turns, pose_leaves
 from ._table_propose import propose
 from ._table_sensors import name_columns
 from ._table_text import LEAST_NUMBERS, Columns, is_text_table, read_csv, text_of
@@ -45,6 +45,7 @@ class Seen(NamedTuple):
     is_imu: bool
     may_be_imu: bool
     has_poses: bool
+    has_turns: bool
     is_mocap: bool
     has_time: bool
     header: tuple[str, ...] = ()  # names of all columns, if the table states them
@@ -71,13 +72,14 @@ def _looked(path: Path, mtime_ns: int, size: int) -> Seen:  # the key notices a 
             if not error.what.startswith(NO_NUMBERS):  # of a file of settings, say
                 logger.warning("left out: %s", error)
     if not columns.values:
-        return Seen(False, False, False, is_mocap(start), False)
+        return Seen(False, False, False, False, is_mocap(start), False)
     names = tuple(sorted(columns.values))
     name_columns(columns, "")
     entries = (known_layout(columns) or propose(columns)).entries
     is_imu, is_captured = entries.keys() >= {"gyro", "accel"}, is_mocap(start) or columns.is_mocap
     header = () if any(re.fullmatch(r"column \d+", name) for name in names) else names
-    return Seen(is_imu, bool(perhaps(columns)), has_poses(columns), is_captured, "time" in entries, header)
+    turns = has_turns({leaf: column for column, (_, leaf) in pose_leaves(columns.values).items()})
+    return Seen(is_imu, bool(perhaps(columns)), has_poses(columns), turns, is_captured, "time" in entries, header)
 
 
 def span_ns(path: Path) -> tuple[int, int] | None:

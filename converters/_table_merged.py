@@ -1,4 +1,4 @@
-"""Stamps in two columns, and tables of several sensors with times of their own."""
+"""Stamps in two columns, sensors with times of their own, and poses in two tables."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from itertools import product
 
 import numpy as np
 
-from ._table_names import TIME_WORDS, name_and_unit
+from ._table_map import IMU_GROUP
+from ._table_names import TIME_WORDS, name_and_unit, split_name
+from ._table_pose_names import has_turns, pose_leaves, position_of
+from ._table_sensors import SENSORS
 from ._table_text import Columns
 from ._table_times import goes_on
 
@@ -17,6 +20,8 @@ BELOW_SECONDS = {  # names of the rest of a second in a column of its own, and i
     re.compile(r"n(ano)?s(ec(ond)?s?)?", re.IGNORECASE): 1,
     re.compile(r"(u|micro)s(ec(ond)?s?)?", re.IGNORECASE): 1000,
 }
+POSITIONS = r"(.*_)?(pos(e|ition)?s?|translations?|traj(ectory)?|locations?|xyz)(_.*)?"  # names of a table of positions
+MOST_STEPS = 4.0  # median steps of positions, over which none are interpolated
 TIME_OF = rf"((?P<before>.+?)_)?{TIME_WORDS}|{TIME_WORDS}_(?P<behind>.+)"  # imu_time, time_gps
 
 
@@ -89,3 +94,35 @@ def _take_rows(columns: Columns, column: str, rows: np.ndarray, into: Columns, n
     into.values[name], into.units[name] = columns.values[column][rows], columns.units.get(column, "")
     if column in columns.texts:
         into.texts[name] = [columns.texts[column][row] for row in np.flatnonzero(rows).tolist()]
+
+
+def join_positions(columns: Columns) -> None:
+    """Give orientations in a table of their own the positions of another one.
+
+    They are interpolated to the times of the orientations, but not across gaps.
+    """
+    turns, places = dict[str, str](), dict[str, list[str]]()  # times of such tables, by group
+    for group in columns.sources.keys() - {IMU_GROUP, *SENSORS}:
+        own = {column.removeprefix(f"{group}/"): column for column in columns.values if column.startswith(f"{group}/")}
+        leaves = {leaf: own[name] for name, (_, leaf) in pose_leaves(own).items()}
+        times = [c for leaf, c in leaves.items() if re.fullmatch(TIME_WORDS, leaf) and goes_on(columns.values[c])]
+        position, is_turned = position_of(leaves), has_turns(leaves)
+        if times and is_turned and not position:
+            turns[group] = times[0]
+        elif times and position and not is_turned and re.fullmatch(POSITIONS, split_name(group)[0]):
+            places[group] = [times[0], *position]
+    if len(turns) != 1 or len(places) != 1:
+        return
+    ((group, time),), ((other, (at, *position)),) = turns.items(), places.items()
+    units = [name_and_unit(each, columns.units.get(each, ""))[1] for each in (time, at)]
+    t, t_p = (columns.values[each].astype(float) for each in (time, at))
+    if units[0] != units[1] or len(t_p) < 2:
+        return
+    behind = np.clip(np.searchsorted(t_p, t), 1, len(t_p) - 1)
+    is_known = (t >= t_p[0]) & (t <= t_p[-1]) & (np.diff(t_p)[behind - 1] <= MOST_STEPS * np.median(np.diff(t_p)))
+    for axis, column in zip("xyz", position, strict=True):
+        name = f"{group}/position_{axis}"
+        columns.values[name] = np.where(is_known, np.interp(t, t_p, columns.values[column].astype(float)), np.nan)
+        columns.units[name] = name_and_unit(column, columns.units.get(column, ""))[1]
+    said = f"the positions of {columns.sources[other]} are interpolated to the times of {columns.sources[group]}"
+    columns.remarks.notes.append(f"{said}, which has orientations")

@@ -60,7 +60,7 @@ WORDS = {
     "accel": r"accel((eration|erometer)s?)?|acc[el]?|ac|(?<![pr]_[a-z]{2}_)a|fb|g_?force|gf|linear_?acceleration"
     r"|specific_?force|sp_?force|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
 }
-STATES = r"_(raw|adc|counts?|(un)?cal(ib)?(rated)?|data|values?|readings?|meas(ured)?)"  # of the numbers in a column
+STATES = r"_(sensor|raw|adc|counts?|(un)?cal(ib)?(rated)?|data|values?|readings?|meas(ured)?)"  # of the numbers in a column
 STATE = rf"(?P<state>({STATES})?)"
 PLACES = (  # of several IMUs on a body
     r"((left|right|upper|lower|l|r)_?)*(left|right|head|neck|chest|back|torso|trunk|sternum|pelvis|waist|hip|arm|forearm|wrist"

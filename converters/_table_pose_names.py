@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 
 from ._table_geodetic import LOCAL
-from ._table_names import DIGITS, split_name
+from ._table_names import DIGITS, TIME_WORDS, group_of, leaf_of, split_name
 from ._table_text import Columns
 
 FRAMES = r"(_[a-z]{2})?"  # of a rotation or a position, as in q_wb, R_wb, p_wb
@@ -25,7 +25,9 @@ POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (POSITION, "xyz"),
     (r"(p(os(ition)?)?_?)?(?P<axis>east|north|up)", ("east", "north", "up")),
     (rf"(p(os(ition)?)?_?|{LOCAL})?(?P<axis>north|east|down)", ("north", "east", "down")),
-    (r"p_?(?P<axis>[ned])", "ned"),
+    (r"p(os(ition)?)?_?(?P<axis>[ned])", "ned"),
+    (r"(p(os(ition)?)?_?)?ned_?(?P<axis>[xyz])", "xyz"),
+    (r"(p(os(ition)?)?_?)?(?P<axis>[xyz])_?ned", "xyz"),
 )
 NED = POSITIONS[2:]
 MATRIX = rf"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r|c){FRAMES}_?(?P<axis>[0-3][0-3]|\d)"  # or Rot[8]
@@ -39,10 +41,26 @@ INDICES = [[f"{row + first}{column + first}" for row in range(3) for column in r
 NUMBERS = "012345678", "123456789"
 
 
+def pose_leaves(columns: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """Owner and name of columns in their groups.
+
+    The name of axes alone begins with that of their group: `pose.position.x` is `position_x` of `pose`. So a magnetometer
+    `mag.x` is no position, and the `x` of a body with `qw` is one. Columns of other groups have no owner.
+    """
+    leaves = {column: split_name(leaf_of(column))[0] for column in columns}
+    beside: dict[str, set[str]] = {}
+    for column, leaf in leaves.items():
+        beside.setdefault(group_of(column), set()).add(leaf)
+    alone = {group for group, names in beside.items() if all(re.fullmatch(rf"[wxyz]|{TIME_WORDS}", name) for name in names)}
+    groups = {c: group_of(c) for c, leaf in leaves.items() if re.fullmatch("[wxyz]", leaf) and group_of(c) in alone - {""}}
+    own = {c: (group_of(group), f"{split_name(leaf_of(group))[0]}_{leaves[c]}".lstrip("_")) for c, group in groups.items()}
+    return {column: own.get(column, ("", leaf)) for column, leaf in leaves.items()}
+
+
 def has_poses(columns: Columns) -> bool:
     """Whether a table has positions and quaternions, matrices or angles, in whatever order."""
-    leaves = {split_name(column)[0]: column for column in columns.values}
-    return _has_turns(leaves) and bool(position_of(leaves))
+    leaves = {leaf: column for column, (_, leaf) in pose_leaves(columns.values).items()}
+    return has_turns(leaves) and bool(position_of(leaves))
 
 
 def why_no_poses(columns: Columns, group: str) -> str:
@@ -50,14 +68,16 @@ def why_no_poses(columns: Columns, group: str) -> str:
     noted = (note for note in columns.remarks.notes if NOT_ALIKE in note and f"{group}/" in note)
     if group and (note := next(noted, "")):
         return note
-    leaves = {split_name(name.removeprefix(f"{group}/"))[0]: name for name in columns.values if name.startswith(f"{group}/")}
-    if position_of(leaves) and not _has_turns(leaves):
+    own = {name.removeprefix(f"{group}/"): name for name in columns.values if name.startswith(f"{group}/")}
+    leaves = {leaf: own[name] for name, (_, leaf) in pose_leaves(own).items()}
+    if position_of(leaves) and not has_turns(leaves):
         return "it has positions without orientations, and imutool uses no positions alone; its columns are topics of the log"
     said = "no time with positions and rotations of a certain order was found in it"
     return f"{said}; a map names its columns (truth_time, position, quaternion_wxyz or another rotation)"
 
 
-def _has_turns(leaves: dict[str, str]) -> bool:
+def has_turns(leaves: dict[str, str]) -> bool:
+    """Whether there are quaternions, matrices or angles."""
     quaternion = axes_of(QUATERNION, leaves, "wxyz") or axes_of(QUATERNION_ARRAY, leaves, "0123")
     return bool(quaternion or matrix_of(leaves) or angles_of(leaves))
 

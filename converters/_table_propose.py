@@ -124,7 +124,12 @@ def _propose_stated(
         listed = ", ".join(chosen)
         proposal.reasons.append(f"{listed} state different units: {sensor}_scale = [x, y, z] in a map brings them to one")
     elif re.search(SI_WORDS, names[chosen[0]][0]):
-        proposal.entries[f"{sensor}_unit"] = next(iter(units))
+        unit = proposal.entries[f"{sensor}_unit"] = next(iter(units))
+        level, near = gravity_units(columns, chosen) if sensor == "accel" else (0.0, [])
+        if near and unit not in near:
+            proposal.open.append("accel_unit")
+            said = f"the median acceleration is {level:.4g}: gravity in {' or '.join(near)}"
+            proposal.reasons.append(f"by their names the columns may be in {unit}, and {said}")
     else:
         _propose_unit(proposal, sensor, columns)
 
@@ -158,6 +163,11 @@ def _propose_gyro_unit(proposal: Proposal, columns: Columns, given: Entries) -> 
     if stated and steps and steps[0] != stated and "gyro_unit" not in given:
         proposal.open.append("gyro_unit")
         proposal.reasons.append(f"the names of the columns say {stated}, and {said}")
+    elif stated and not {*proposal.open} | ({"gyro", "gyro_unit"} & given.keys()) and not _states_unit(proposal, columns):
+        motion = unit_by_motion(proposal, columns)
+        if motion and motion[0] != stated:
+            proposal.open.append("gyro_unit")
+            proposal.reasons.append(f"by their names the columns may be in {stated}, and {motion[1]}")
     if "gyro_unit" not in proposal.open or stated:
         return
     motion = unit_by_motion(proposal, columns) if {*proposal.open} <= {"gyro_unit", "accel_unit"} else None
@@ -166,6 +176,11 @@ def _propose_gyro_unit(proposal: Proposal, columns: Columns, given: Entries) -> 
         proposal.settle_unit("gyro", *found.popitem())
     else:
         proposal.reasons.extend(found.values())
+
+
+def _states_unit(proposal: Proposal, columns: Columns) -> bool:
+    """Whether a column of the gyro states its unit, and not only a name that ROS uses."""
+    return any(name_and_unit(c, columns.units.get(c, ""))[1] for c in proposal.unsigned("gyro", columns))
 
 
 def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:

@@ -61,6 +61,9 @@ def role_groups(tables: Names) -> dict[Path, str]:
     words = {path: re.sub(SPACED, "_", stem).lower() for path, stem in tables.items()}  # viconRot1
     true = captured or [path for path in tables if re.fullmatch(POSES, words[path])]
     true = true or [p for p in tables if re.fullmatch(REFERENCE, words[p]) and seen[p].has_poses and not seen[p].is_imu]
+    turned = [path for path in true if seen[path].has_turns]
+    if len(true) == 2 and len(turned) == 1 and not seen[turned[0]].has_poses:  # its positions are in the other one
+        true = turned
     if of_sensors:
         return of_sensors | {path: TRUTH_GROUP for path in true if len(true) == 1 and path not in of_sensors}
     shown = [path for path in tables if seen[path].is_imu and path not in true]

@@ -37,6 +37,7 @@ NEAR_ONE = 0.01
 ALWAYS = 0.99  # share of the steps of a time that lead up
 PLACES = 3  # first fields of a row, of which one may name its sensor
 KIND = r"[@$%/]?[A-Za-z][\w/.:-]*|/[\w/.:-]+"  # a word that names the kind of a row, or the device that it is of
+OTHER = "other"  # kind of the rows that name none
 FLAGS = r"(?i)true|false|yes|no|on|off|ok|none|nan|[a-z]"  # words that a device writes of its state
 DEVICE = r"(?i)(sensor|device|imu|node|unit)([ _]?(id|no|nr|num(ber)?|index|name))?|id|mac|address"  # in a header
 BY_TURNS, LEAST_SHARE = 0.2, 0.1  # of rows that are of another device than the one before; of the rows, of each device
@@ -97,9 +98,11 @@ def read_rows(text: str, columns: Columns, path: Path) -> bool:
     tables: dict[str, list[str]] = {}
     for row in rows:
         if len(row) > place:
-            tables.setdefault(row[place].strip(), []).append(mark.join(row[:place] + row[place + 1 :]))
+            tables.setdefault(row[place].strip() or OTHER, []).append(mark.join(row[:place] + row[place + 1 :]))
     header = (
-        tables.pop(rows[0][place].strip()) if not any(re.fullmatch(r"[-+.\deE]+", field.strip()) for field in rows[0]) else []
+        tables.pop(rows[0][place].strip() or OTHER)
+        if not any(re.fullmatch(r"[-+.\deE]+", field.strip()) for field in rows[0])
+        else []
     )
     for name, table in tables.items():
         stated = (match for line in lines if (match := re.search(rf"\b{re.escape(name + mark)}(.*[a-zA-Z].*)", line)))

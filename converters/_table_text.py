@@ -41,6 +41,8 @@ LEAST_NAMED = 0.1  # share of the rows that have as many fields as the header, i
 LOOKED_AT = 200  # first lines, which show whether text is a table
 FIRSTS = 50  # rows that show what a column without a name counts
 COMMENTS = "#", "%", "//"
+FIRST_CHARACTERS = 4096  # of a text, which show how its lines begin
+ARRIVAL = re.compile(r"^(\d\d:\d\d:\d\d\.\d{3}) -> ")  # of Arduino's serial monitor
 STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
     r"\W*(?P<name>[a-z][\w ]{,40}?) *[:=,;\t] *(?P<value>\d{1,9}(\.\d{,15})?) *(?P<unit>k?hz|m?s)?\W*", re.IGNORECASE
 )
@@ -124,6 +126,10 @@ class Columns:
 
 def text_of(raw: bytes) -> str:
     """Text in UTF-8 or UTF-16, else in the code page of Western Windows, which Excel writes."""
+    return _with_arrivals(_decoded(raw))
+
+
+def _decoded(raw: bytes) -> str:
     if raw.startswith(UTF16):
         return raw.decode("utf-16", "replace")
     try:
@@ -131,6 +137,16 @@ def text_of(raw: bytes) -> str:
     except UnicodeDecodeError as error:
         cut = error.start >= len(raw) - 3  # inside a character
         return raw.decode("utf-8-sig", "ignore") if cut else raw.decode("cp1252", "replace")
+
+
+def _with_arrivals(text: str) -> str:
+    """Text in which the times before Arduino's rows are fields, `15:04:05.123 -> 0.1,0.2`; any other text as it is."""
+    rows = [row for line in text[:FIRST_CHARACTERS].splitlines() if (row := ARRIVAL.sub("", line)) != line]
+    if len(rows) <= text[:FIRST_CHARACTERS].count("\n") / 2:
+        return text
+    mark = max(";\t, ", key=lambda each: sum(each in row for row in rows))
+    named = re.sub(rf"{ARRIVAL.pattern}(?=\D*$)", f"arrival{mark}", text, flags=re.MULTILINE)  # a board's own time counts first
+    return re.sub(ARRIVAL.pattern, rf"\1{mark}", named, flags=re.MULTILINE)
 
 
 def is_text_table(head: bytes, least: int = LEAST_NUMBERS) -> bool:
@@ -149,7 +165,7 @@ def _delimiter(rows: list[str], least: int = LEAST_NUMBERS) -> str | None:
 
     Where each row may be one number with a decimal comma, a header of as many names shows two.
     """
-    looked, marks = rows[:LOOKED_AT], (";", "\t", ",", None)
+    looked, marks = rows[:LOOKED_AT], (";", "\t", ",", "|", None)
     widths = {mark: Counter(len(row.split(mark)) for row in looked if _is_row(row, mark, least)) for mark in marks}
     best = max(marks, key=lambda mark: max(widths[mark].values(), default=0))  # of equals the first
     headers = {len(row.split(",")) for row in looked if not _is_row(row, ",", least)}

@@ -17,7 +17,7 @@ import numpy as np
 
 from imutool.array_types import Bool, Float64, Int64
 from imutool.recording import nanoseconds
-from imutool.recording.sample_order import spread_stamps
+from imutool.recording.sample_order import Ticked, spread_stamps, ticked
 
 WINDOW = 256  # samples, several batches of any driver; a cheap sensor's rate wanders within seconds
 GAP_NS = nanoseconds(0.5)  # no longer step says anything of the period
@@ -118,9 +118,11 @@ def batch_words(size: float) -> str:
 def usual_period(stamp_ns: Int64[np.ndarray, " n"]) -> float:
     """Usual period of a sensor (ns); 0 for fewer than two stamps.
 
-    It is the median step. Where many steps are short, stamps are late by a good part of a period: then the median over 16
-    samples counts. Lost samples make that too long, but leave no short steps.
+    It is the median step, but for a clock in coarse ticks. Where many steps are short, stamps are late by a good part of a
+    period: then the median over 16 samples counts. Lost samples make that too long, but leave no short steps.
     """
+    if coarse := ticked(stamp_ns):
+        return coarse.period_ns
     steps = np.diff(stamp_ns)
     median = float(np.median(steps)) if len(steps) else 0.0
     if len(steps) <= SPAN or (steps < SHORT * median).mean() < MANY_SHORT:
@@ -128,30 +130,37 @@ def usual_period(stamp_ns: Int64[np.ndarray, " n"]) -> float:
     return float(np.median(stamp_ns[SPAN:] - stamp_ns[:-SPAN])) / SPAN
 
 
-def stay_late(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Bool[np.ndarray, " m"]:
+def stay_late(stamp_ns: Int64[np.ndarray, " n"], period_ns: float, span: int = SPAN) -> Bool[np.ndarray, " m"]:
     """Steps behind which the stamps stay late, as behind a sample that is lost.
 
-    Behind one that is late they do not. The earliest of the stamps on both sides, against a line of the period, are compared.
+    Behind one that is late they do not. The earliest of `span` stamps on both sides are compared, against a line of the period.
     """
     line = (stamp_ns - stamp_ns[:1]).astype(np.float64) - period_ns * np.arange(len(stamp_ns))
     before, behind = line.copy(), line.copy()
-    for back in range(1, min(SPAN, len(line))):
-        np.minimum(before[back:], line[:-back], out=before[back:])
-        np.minimum(behind[:-back], line[back:], out=behind[:-back])
+    for back in (1 << n for n in range(span.bit_length() - 1)):  # minima of 2, 4, 8, ... samples
+        before[back:] = np.minimum(before[back:], before[:-back])
+        behind[:-back] = np.minimum(behind[:-back], behind[back:])
     late: Bool[np.ndarray, " m"] = behind[1:] - before[:-1] > STAYS * period_ns
     return late
 
 
-def lost_samples(stamp_ns: Int64[np.ndarray, " n"], period_ns: float, steps: Bool[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
+def lost_samples(
+    stamp_ns: Int64[np.ndarray, " n"], period_ns: float, steps: Bool[np.ndarray, " m"], coarse: Ticked | None
+) -> Int64[np.ndarray, " m"]:
     """Number of samples lost in each of `steps` behind which the stamps stay late.
 
     Each is counted once. The earliest stamps on both sides show how many are lost. What is later than these is late, not lost.
+    Steps that a clock in `coarse` ticks explains have lost none.
     """
-    lost, last = np.zeros(len(steps), np.int64), -1
-    for row in np.flatnonzero(steps & stay_late(stamp_ns, period_ns)).tolist():
-        first, behind = max(last + 1, row - SPAN + 1), row + 1
+    lost, last, span = np.zeros(len(steps), np.int64), -1, SPAN
+    if coarse:
+        period_ns, tick_ns, span = coarse
+        steps = steps & (np.diff(stamp_ns) > period_ns)
+        steps[-span:] &= np.diff(stamp_ns)[-span:] > period_ns + tick_ns  # where few stamps show it
+    for row in np.flatnonzero(steps & stay_late(stamp_ns, period_ns, span)).tolist():
+        first, behind = max(last + 1, row - span + 1), row + 1
         held_back = int((np.diff(stamp_ns[row : behind + AHEAD]) < BUNCHED * period_ns).sum()) > SPAN // 2
-        near = stamp_ns[first : behind + (AHEAD if held_back else SPAN)]  # over more samples a rate that wanders hides losses
+        near = stamp_ns[first : behind + (AHEAD if held_back else span)]  # over more samples a rate that wanders hides losses
         line = (near - near[0]) - period_ns * np.arange(len(near))
         late_ns = line[behind - first :].min() - line[: behind - first].min()
         lost[row] = max(0, round(float(late_ns) / period_ns))
@@ -222,7 +231,7 @@ def _lost(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Bool[np.ndarra
     late, is_long = stay_late(stamp_ns, period_ns), np.diff(stamp_ns) > GAP_BATCHES * period_ns
     begins = late & ~np.concatenate([late[:1], late[:-1]])
     begins[:SPAN] = begins[-SPAN:] = False  # where few stamps show it
-    return lost_samples(stamp_ns, period_ns, begins | (late & is_long)) > 0
+    return lost_samples(stamp_ns, period_ns, begins | (late & is_long), ticked(stamp_ns)) > 0
 
 
 def _at_one_rate(stamp_ns: Int64[np.ndarray, " n"], batch: float) -> Iterator[tuple[int, int]]:

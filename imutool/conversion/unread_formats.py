@@ -31,7 +31,7 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "it is an sdlog2 log of PX4 before 2017",
         "Make a CSV of it with sdlog2_dump.py of PX4, and convert that with a map of its columns",
     ),
-    rb"#[A-Z0-9]{4,}A,[A-Z0-9_]+,\d": (
+    rb"[#%][A-Z0-9]{4,}A,[A-Z0-9_]+,\d": (  # with a long or a short header
         "it is an ASCII log of a NovAtel receiver, whose RAWIMU holds counts of a scale that depends on the IMU",
         "Make a CSV of it in rad/s and m/s^2 with the scale that NovAtel's manual states for the IMU, and convert that",
     ),

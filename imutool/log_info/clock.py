@@ -15,7 +15,8 @@ from imutool.cleaning.rules.gaps import PAUSE_NS
 from imutool.cleaning.samples import BLOCK
 from imutool.cleaning.stamp_line import FRACTIONS, MANY_SHORT, SECOND_NS, SHORT, SPAN, bunched
 from imutool.log_info.report import Clock
-from imutool.recording.columns import clock_jumps
+from imutool.recording.columns import clock_jumps, median
+from imutool.recording.sample_order import ticked
 
 UNUSUAL = 0.5  # share by which a period may differ from the median, to count for the rate
 MOST_BATCHED = 0.2  # share of short steps up to which stamps surely come one by one
@@ -80,13 +81,13 @@ class Steps:
         if not self.count:
             return Clock(None, None, None, first_ns, last_ns)
         steps, count, variance = self._table()
-        median = self.median()
+        middle = self.median()
 
         def mean(values: Float64[np.ndarray, " m"], use: Bool[np.ndarray, " m"]) -> float:
             return float((count * values)[use].sum() / count[use].sum())
 
-        usual = np.abs(steps - median) <= UNUSUAL * median  # the median itself is coarse where times are whole ms
-        period = mean(steps, usual) if median > 0 and usual.any() else median  # none is near where two differ
+        usual = np.abs(steps - middle) <= UNUSUAL * middle  # the median itself is coarse where times are whole ms
+        period = mean(steps, usual) if middle > 0 and usual.any() else middle  # none is near where two differ
         steady = steps <= PAUSE_NS  # that nobody recorded is no jitter
         away = steps - mean(steps, steady) if steady.any() else steps
         return Clock(
@@ -109,6 +110,7 @@ class IncreasingStamps:
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self.steps = Steps()
+        self._ticked, self._blocks = list[float](), 0  # periods of blocks whose stamps are in coarse ticks, and all blocks
         self.long_ns = np.zeros(0, np.int64)
         self.jumps: list[tuple[int, float]] = []
 
@@ -131,10 +133,18 @@ class IncreasingStamps:
     def add(self, stamp_ns: Int64[np.ndarray, " n"], steps_ns: Int64[np.ndarray, " m"]) -> None:
         """Add stamps that increase, and the steps to them."""
         self.steps.see(steps_ns)
+        self._ticked.extend([coarse.period_ns] if (coarse := ticked(stamp_ns)) else [])
+        self._blocks += 1
+
+    @property
+    def ticked_ns(self) -> float:
+        """Period of a sensor whose stamps are mostly in coarse ticks; else 0."""
+        return float(median(np.array(self._ticked))) if 2 * len(self._ticked) > self._blocks else 0.0
 
     def clock(self) -> Clock:
         """Clock of the stamps."""
-        return self.steps.clock(self.first_ns, self.last_ns)
+        clock = self.steps.clock(self.first_ns, self.last_ns)
+        return clock._replace(rate_hz=1e9 / self.ticked_ns) if self.ticked_ns else clock
 
 
 class SensorStamps(IncreasingStamps):
@@ -166,9 +176,9 @@ class SensorStamps(IncreasingStamps):
     @property
     def period_ns(self) -> float:
         """Usual period, as `stamp_line.usual_period`."""
-        median = self.steps.median()
-        if self.steps.count <= SPAN or self.steps.share_below(SHORT * median) < MANY_SHORT:
-            return median
+        usual = self.steps.median()
+        if self.ticked_ns or self.steps.count <= SPAN or self.steps.share_below(SHORT * usual) < MANY_SHORT:
+            return self.ticked_ns or usual
         return self._spans.median() / SPAN
 
 

@@ -18,16 +18,17 @@ from imutool.cleaning.rules.gaps import missing
 from imutool.cleaning.rules.not_finite import measured
 from imutool.cleaning.rules.saturation import AxisLimits
 from imutool.cleaning.samples import Samples, blocks, joined
-from imutool.cleaning.stamp_line import SPAN, Stamps, distinct, read_stamps, restamped, usual_period
+from imutool.cleaning.stamp_line import Stamps, distinct, read_stamps, restamped, usual_period
 from imutool.log_info.clock import IncreasingStamps, SensorStamps, sorted_stamps
 from imutool.log_info.report import Interval
 from imutool.mcap_io.log import Log
 from imutool.recording import nanoseconds
 from imutool.recording.columns import clock_jumps
+from imutool.recording.sample_order import TICK_SPAN, ticked
 
 APART_NS = nanoseconds(60.0)  # of stretches that are read by themselves
 ROUNDING_NS = 1024  # of times as floats
-MARGIN = SPAN + 1  # stamps on both sides that show whether a step lost samples
+MARGIN = TICK_SPAN + 1  # stamps on both sides that show whether a step lost samples
 NO_FAULTS = Stamps(np.zeros(0, np.int64), "", Counter(), 1.0, unset=False)
 
 
@@ -87,7 +88,7 @@ class ImuSamples:
         self.counts["out_of_order"] = int((t_ns < np.maximum.accumulate(t_ns)).sum()) if len(t_ns) else 0
         self.counts["duplicated"] = len(t_ns) - len(distinct(t_ns))
         line = distinct(restamped(t_ns) if self.stamps.batch > 1.0 or self.stamps.fraction else t_ns)
-        self.counts["missing"] = int(missing(line, usual_period(line)).sum()) if len(line) > 1 else 0
+        self.counts["missing"] = int(missing(line, usual_period(line), ticked(line)).sum()) if len(line) > 1 else 0
         ordered, first = np.unique(t_ns[rows], return_index=True)
         self._rank = np.full(len(t_ns), -1)
         self._rank[rows[first]] = np.arange(len(first))
@@ -104,16 +105,16 @@ class ImuSamples:
 
     def _lost(self, stream: Iterable[Samples]) -> Iterator[Samples]:
         """Counts the samples that are missing between stamps that increase."""
-        t_ns, judged = np.zeros(0, np.int64), 0
+        t_ns, judged, coarse = np.zeros(0, np.int64), 0, None
         for samples in stream:
             yield samples
             t_ns = np.concatenate([t_ns, samples.stamp_ns])
-            end = max(judged, len(t_ns) - 1 - MARGIN)
+            end, coarse = max(judged, len(t_ns) - 1 - MARGIN), ticked(t_ns, coarse)
             if end > judged:
-                self.counts["missing"] += int(missing(t_ns, self._period_ns)[judged:end].sum())
+                self.counts["missing"] += int(missing(t_ns, self._period_ns, coarse)[judged:end].sum())
             t_ns, judged = t_ns[max(end - MARGIN, 0) :], min(end, MARGIN)
         if len(t_ns) > 1:
-            self.counts["missing"] += int(missing(t_ns, self._period_ns)[judged:].sum())
+            self.counts["missing"] += int(missing(t_ns, self._period_ns, coarse)[judged:].sum())
 
     def _reached(self, stream: Iterable[Samples]) -> Iterator[Samples]:
         """Counts the samples that reach the limit of an axis."""

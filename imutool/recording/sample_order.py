@@ -10,16 +10,18 @@ they end at the next one. Any other sample that is alone with its stamp keeps it
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from imutool.array_types import Bool, Float64, Int64
-from imutool.recording.columns import clock_jumps, median
+from imutool.recording.columns import clock_jumps, median, quantile
 
 MOST_SET_BACK = 0.01  # share of samples that a clock which was set back may cost; of more they are several recordings
 GAP_STEPS = 1.5  # median steps: a longer step holds a gap
 NEAR = 64  # stamps whose median step counts: a logger may go on at another rate
 CLEARLY = 0.9  # of the unevenness towards the next stamp: what is left at most where samples came late
+MOST_TICKS, TICK_SPAN = 8, 256  # in a period of stamps that count in coarse ticks; samples, whose spans differ by a tick or two
 MOST_ALIKE = 0.5  # share of the stamps with several samples from which on their number is that of a batch
 
 
@@ -143,3 +145,35 @@ def lost_to_set_back(t_ns: Int64[np.ndarray, " n"], name: str) -> list[str]:
     what = f"{name}: {lost} of {len(t_ns)} samples are left out, as their time goes back to that of samples before them"
     fix = "; if the table holds several recordings, give each a table of its own, or add a column `trial` that tells them apart"
     return [what + fix * any(step_s < 0.0 for _, step_s in clock_jumps(t_ns))]
+
+
+class Ticked(NamedTuple):
+    """Clock in ticks of a large part of a sensor's period (ns).
+
+    `span` stamps show the line above them.
+    """
+
+    period_ns: float
+    tick_ns: float
+    span: int
+
+
+def ticked(t_ns: Int64[np.ndarray, " n"], before: Ticked | None = None) -> Ticked | None:
+    """Even clock behind stamps in coarse ticks; None of others.
+
+    Its steps alternate, as 1, 1, 1 and 2 ms at 800 Hz. Samples that are lost by chance make no such clock: the shorter quarter
+    of the spans of 256 samples differ by more ticks. Of stamps too few to show it, it is the clock `before` them.
+    """
+    if len(t_ns) < 2 * TICK_SPAN:
+        return before
+    steps_us = np.rint(np.diff(t_ns) / 1000.0).astype(np.int64)  # a float of seconds since 1970 keeps a microsecond
+    tick_us = int(np.gcd.reduce(steps_us[:TICK_SPAN]))
+    if tick_us <= 0 or (steps_us % tick_us).any() or median(steps_us) > MOST_TICKS * tick_us:
+        return None
+    spans_us = (t_ns[TICK_SPAN:] - t_ns[:-TICK_SPAN]) * 1e-3
+    low, high = (float(quantile(spans_us, share)) for share in (0.05, 0.25))
+    ticks = float(spans_us[spans_us < low + 1.5 * tick_us].mean()) / TICK_SPAN / tick_us
+    apart = abs(ticks - round(ticks))
+    if high - low > 1.5 * tick_us or ticks < 1.0 or apart * TICK_SPAN < 2.0:  # each step of whole ticks shows the period
+        return None
+    return Ticked(ticks * tick_us * 1e3, tick_us * 1e3, 1 << max(4, int(np.ceil(np.log2(2.0 / apart)))))

@@ -7,6 +7,8 @@ import pytest
 
 from imutool.cleaning.rules.gaps import missing
 from imutool.cleaning.stamp_line import GAP_NS, read_stamps, restamped, unrounded, usual_period
+from imutool.log_info.clock import IncreasingStamps
+from imutool.recording.sample_order import ticked
 
 PERIOD_NS = 5_000_321
 START_NS = 1_700_000_000_000_000_000
@@ -97,6 +99,28 @@ def test_many_lost_samples_are_counted_though_they_make_long_steps() -> None:
     stamps = sampled()[kept]
     assert usual_period(stamps) == pytest.approx(PERIOD_NS, rel=1e-3)
     assert missing(stamps, usual_period(stamps)).sum() == 12_000 - kept.sum()
+
+
+@pytest.mark.parametrize("rate_hz", [416, 800, 952])
+@pytest.mark.parametrize("lost", [(), (900, 901, 5000)])
+def test_whole_milliseconds_of_an_even_sensor_show_its_rate_and_what_is_lost(rate_hz: int, lost: tuple[int, ...]) -> None:
+    """Their steps alternate, as 1, 1, 1 and 2 ms at 800 Hz, which is no loss of every fourth sample at 1000 Hz."""
+    true = START_NS + np.arange(8000) * 10**9 // rate_hz
+    kept = np.delete(true, lost) if lost else true
+    stamps = kept // 1_000_000 * 1_000_000
+    assert missing(stamps, usual_period(stamps), ticked(stamps)).sum() == len(lost)
+    assert 1e9 / usual_period(stamps) == pytest.approx(rate_hz, rel=1e-3)
+    clock = IncreasingStamps()
+    clock.see(stamps)
+    assert clock.clock().rate_hz == pytest.approx(rate_hz, rel=1e-3)
+    if not lost:
+        assert np.ptp(restamped(stamps) - true) < 200_000
+
+
+def test_samples_lost_by_chance_are_lost_though_the_stamps_are_whole_milliseconds() -> None:
+    stamps = (START_NS + np.arange(12_000) * 1_000_000)[np.random.default_rng(6).random(12_000) > 0.03]
+    assert ticked(stamps) is None
+    assert missing(stamps, usual_period(stamps)).sum() == pytest.approx(12_000 - len(stamps), rel=0.02)
 
 
 def test_a_logger_that_slows_down_does_not_write_in_batches() -> None:

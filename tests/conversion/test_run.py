@@ -326,6 +326,7 @@ def test_converting_needs_no_torch():
     ("start", "said"),
     [
         (b"#RAWIMUSXA,COM1,0,81.5,FINESTEERING,1691,410338.819,00000020,3fdf,43495;00,11,1691\n", "NovAtel receiver.*CSV"),
+        (b"%RAWIMUSXA,2209,491674.014;04,41,2209,491674.013699,ea59fe00,329308016,-2706935\n", "NovAtel receiver.*CSV"),
         (b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n", "blackbox log of Betaflight.*blackbox_decode"),
         (bytes.fromhex("00060d058847e8f3fd0900000000"), "telemetry log of MAVLink.*vehicle's own log"),
         (b"\xa3\x95\x80\x027ATT\0fffffffffffff", "sdlog2 log of PX4.*sdlog2_dump.py"),

@@ -224,6 +224,15 @@ def test_settings_of_the_sensors_and_what_was_not_read_are_kept_as_metadata(make
     assert "is left out: of such a folder imu0" in other.metadata["imutool/losses"]["imu1"]
 
 
+@pytest.mark.parametrize(("x", "is_said"), [(0.0, False), (0.3, True)])
+def test_an_imu_that_is_mounted_apart_from_the_poses_is_said(make, x, is_said):
+    mounted = f"T_BS:\n  cols: 4\n  rows: 4\n  data: [1, 0, 0, {x},\n    0, 1, 0, 0, 0, 0, 1, 0, 0.0, 0.0, 0.0, 1.0]\n"
+    files = {**make.files("euroc"), "mav0/imu0/sensor.yaml": mounted.encode()}
+    (recording,) = euroc.read(make.folder("one", files))
+    said = recording.metadata["imutool/skipped"].get("imu0/sensor.yaml", "")
+    assert said.startswith("its T_BS is not that of the poses") == is_said
+
+
 @pytest.mark.parametrize("form", ["folder", "zip", "tar", "tar.gz"])
 def test_images_come_out_byte_for_byte(make, form):
     files = make.files("euroc")

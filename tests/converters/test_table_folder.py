@@ -554,6 +554,22 @@ def test_tables_of_a_folder_that_show_no_imu_are_named(tmp_path, caplog):
     assert told == f"{tmp_path}: tables that show no IMU are left out: other.csv"
 
 
+def test_what_lies_beside_an_imu_and_is_not_read_is_named(tmp_path, caplog):
+    """An array without names that has a time, as of TLIO, and true poses in a folder of their own, as of ADVIO."""
+    names = ["t [s]", *(f"g{a} [rad/s]" for a in "xyz"), *(f"a{a} [m/s^2]" for a in "xyz")]
+    for folder in ("phone", "ground-truth"):
+        (tmp_path / folder).mkdir()
+    write_csv(tmp_path / "phone" / "imu_samples_0.csv", names, [T_S, *GYRO.T, *ACCEL.T])
+    np.save(tmp_path / "phone" / "imu0_resampled.npy", np.column_stack([T_S, *(5.0 + RNG.normal(0.0, 1.0, (8, COUNT)))]))
+    write_csv(
+        tmp_path / "ground-truth" / "pose.csv", [f"{value}.5" for value in range(8)], [T_S, *RNG.normal(0, 1, (7, COUNT))]
+    )
+    assert len(table.sequences(tmp_path)) == 1
+    told = "\n".join(line.getMessage() for line in caplog.records)
+    assert "tables that show no IMU are left out: imu0_resampled.npy" in told
+    assert "true poses in a folder without an IMU are left out: ground-truth/pose.csv" in told
+
+
 def test_a_folder_of_matrices_asks_for_a_map_and_takes_it(tmp_path):
     """A script of a test bench saves all that it reads in one array, without names."""
     angles = RNG.normal(0.0, 0.4, (COUNT, 3))

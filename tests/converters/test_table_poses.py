@@ -489,3 +489,58 @@ def test_true_poses_in_the_imus_table_may_have_a_time_of_their_own(tmp_path, fir
     log = read(tmp_path)
     assert np.array_equal(log.imus["/imu0"].t_ns, 10_000_000 * np.arange(COUNT))
     np.testing.assert_allclose(log.poses["/ground_truth/pose"].t_ns, 1e9 * (T_S + 0.023), atol=1e3)
+
+
+def test_poses_of_ros_in_tables_are_on_the_stamps_of_their_headers(tmp_path):
+    """As bagpy and `rostopic echo -p` write them; the recorder's own time is 4 ms later."""
+    times_ns = [1e9 * T_S + 4e6, 1e9 * T_S]
+    for name, fields, values in (
+        ("imu", ("angular_velocity.{}", "linear_acceleration.{}"), (GYRO, ACCEL)),
+        ("vicon", ("pose.position.{}", "pose.orientation.{}"), (P_M, XYZW)),
+    ):
+        names = [f"field.{field.format(axis)}" for field in fields for axis in ("xyzw" if "orientation" in field else "xyz")]
+        header = ",".join(["%time", "field.header.stamp", *names])
+        (tmp_path / f"{name}.csv").write_text(f"{header}\n{rows(*times_ns, *values)}")
+    log = read(tmp_path)
+    np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL, atol=1e-6)
+    poses = log.poses["/ground_truth/pose"]
+    np.testing.assert_allclose(poses.t_ns, times_ns[1], atol=1.0)
+    np.testing.assert_allclose(poses.p_wb, P_M, atol=1e-8)
+
+
+@pytest.mark.parametrize(("other", "quaternion"), [("mag", "q"), ("gravity", "attitude.q")])
+def test_other_vectors_beside_an_orientation_are_no_positions(tmp_path, other, quaternion):
+    names = [f"{each}.{axis}" for each in ("gyro", "acc", other) for axis in "xyz"]
+    header = ",".join(["time", *names, *(f"{quaternion}{axis}" for axis in "xyzw")])
+    (tmp_path / "imu.csv").write_text(f"{header}\n{rows(T_S, GYRO, ACCEL, ACCEL / 9.80665, XYZW)}")
+    log = read(tmp_path / "imu.csv")
+    assert log.poses == {}
+    assert f"/{other}_x" in log.scalars
+
+
+@pytest.mark.parametrize(
+    ("names", "kind"), [(("attitude", "position"), "estimate"), (("gt_orientation", "gt_position"), "truth")]
+)
+def test_orientations_and_positions_in_two_tables_are_poses_together(tmp_path, names, kind):
+    (tmp_path / "imu.csv").write_text(imu_text())
+    (tmp_path / f"{names[0]}.csv").write_text("time [s],qx,qy,qz,qw\n" + rows(T_S + 0.003, XYZW))
+    gap = np.r_[np.arange(0, 700, 5), np.arange(800, COUNT, 5)]
+    (tmp_path / f"{names[1]}.csv").write_text("time [s],x,y,z\n" + rows(T_S[gap], P_M[gap]))
+    log = read(tmp_path)
+    ((topic, poses),) = log.poses.items()
+    assert log.kinds[topic] == kind
+    t_s = 1e-9 * poses.t_ns
+    assert len(t_s) == pytest.approx(COUNT - 105, abs=10)  # without the gap, across which nothing is interpolated
+    assert ((t_s < 6.96) | (t_s > 7.99)).all()
+    np.testing.assert_allclose(poses.p_wb, np.sin(t_s[:, None] * [0.5, 0.8, 1.1]), atol=1e-3)
+
+
+@pytest.mark.parametrize("names", ["x_ned,y_ned,z_ned", "pos_ned_x,pos_ned_y,pos_ned_z", "pos_n,pos_e,pos_d"])
+def test_positions_whose_names_say_ned_are_turned_to_a_world_with_z_up(tmp_path, names):
+    (tmp_path / "imu.csv").write_text(imu_text())
+    to_ned = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+    poses = rows(T_S, to_ned.apply(P_M), (to_ned * TURN).as_quat())
+    (tmp_path / "groundtruth.csv").write_text(f"time [s],{names},qx,qy,qz,qw\n{poses}")
+    true = read(tmp_path).poses["/ground_truth/pose"]
+    np.testing.assert_allclose(true.p_wb, P_M, atol=1e-8)
+    np.testing.assert_allclose(Rotation.from_quat(true.q_wb_wxyz, scalar_first=True).as_matrix(), MATRICES, atol=1e-6)

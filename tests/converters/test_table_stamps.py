@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -96,3 +97,13 @@ def test_a_time_that_only_rises_has_a_stamp_for_each_row(tmp_path: Path) -> None
     log = table.read_sequence(table.sequences(tmp_path)[0], mapping={"gyro_unit": "rad/s"})
     assert np.array_equal(log.imus["/imu0"].t_ns, T_NS + 1_700_000_000_000_000_000)
     assert not any("has a stamp for" in note for note in log.remarks.notes)
+
+
+@pytest.mark.parametrize("form", ["%Y%m%d%H%M%S%f", "%Y%m%dT%H%M%S.%f", "%Y%m%d_%H%M%S.%f"])
+def test_dates_without_marks_are_times_in_utc_also_across_midnight(tmp_path: Path, form: str) -> None:
+    start_ms = 1_764_460_798_500  # 2025-11-29 23:59:58.5
+    moments = [datetime.fromtimestamp((start_ms + 10 * n) / 1000, UTC).strftime(form)[:-3] for n in range(COUNT)]
+    rows = lines(np.array(moments), GYRO, ACCEL)
+    (tmp_path / "imu.csv").write_text("\n".join(["timestamp,gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path / "imu.csv")[0], mapping={"gyro_unit": "rad/s"})
+    assert log.imus["/imu0"].t_ns.tolist() == [(start_ms + 10 * n) * 10**6 for n in range(COUNT)]

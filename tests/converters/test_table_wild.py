@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 from pathlib import Path
 
 import numpy as np
@@ -129,6 +130,7 @@ def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
         ([f"w_{a} [deg/s]" for a in "xyz"], [f"f_{a}" for a in "xyz"]),
         ([f"gyr_left_wrist_{a}_dps" for a in "xyz"], [f"acc_left_wrist_{a}" for a in "xyz"]),
         ([f"Gyro{a}_chest (deg/s)" for a in "XYZ"], [f"Accel{a}_chest" for a in "XYZ"]),
+        ([f"Foot Gyroscope {a} [deg/s]" for a in "XYZ"], [f"Foot Accel Sensor {a} [m/s^2]" for a in "XYZ"]),  # Noraxon
         (["p [deg/s]", "q [deg/s]", "r [deg/s]"], [f"accl{k}" for k in range(3)]),
         ([f"flight.{a} [deg/s]" for a in "pqr"], [f"flight.f_{a}" for a in "xyz"]),  # of a structure, or of a folder's table
         ([f"gyro_deg_s[{k}]" for k in range(3)], [f"accelerometer_m_s2[{k}]" for k in range(3)]),
@@ -264,6 +266,31 @@ def test_a_stated_unit_against_the_way_gravity_turns_is_doubted(tmp_path, named,
     assert any("gravity turns" in note and "is the unit right?" in note for note in notes) == doubted
 
 
+@pytest.mark.parametrize("written", ["rad", "deg"])
+def test_a_name_that_only_ros_has_in_rad_is_asked_where_gravity_turns_otherwise(tmp_path, written):
+    t_s = np.arange(3000) * 0.01
+    turn = Rotation.from_euler("xyz", 0.8 * np.sin(t_s[:, None] * [0.9, 1.3, 0.7]))
+    gyro = np.vstack([(turn[:-1].inv() * turn[1:]).as_rotvec() * 100.0, np.zeros(3)])
+    gyro = gyro + 0.002 * np.random.default_rng(3).normal(size=gyro.shape)
+    names = ["t", *(f"Angular Velocity {a}" for a in "XYZ"), *(f"Acceleration {a}" for a in "XYZ")]
+    values = [t_s, *(gyro if written == "rad" else np.degrees(gyro)).T, *turn.inv().apply([0.0, 0.0, 9.8]).T]
+    path = write_csv(tmp_path / "State.csv", names, values)
+    if written == "deg":
+        with pytest.raises(
+            ConfigError, match="may be in rad/s, and gravity turns in the accelerometer as a gyro in deg/s says"
+        ):
+            read(path)
+    else:
+        np.testing.assert_allclose(read(path).imus["/imu0"].gyro, gyro, rtol=1e-9)
+
+
+def test_a_name_that_only_ros_has_in_si_units_is_asked_where_gravity_has_another_unit(tmp_path):
+    names = ["time", *(f"angular_velocity_{a}" for a in "xyz"), *(f"linear_acceleration_{a}" for a in "xyz")]
+    path = write_csv(tmp_path / "ros.csv", names, [T_S, *(COUNTS * 0.011).T, *ACCEL_G.T])
+    with pytest.raises(ConfigError, match=r"may be in m/s\^2, and the median acceleration is .*: gravity in g"):
+        read(path)
+
+
 @pytest.mark.parametrize(("unit", "doubted"), [("ms", True), ("s", False), ("us", True)])
 def test_a_stated_unit_of_the_time_that_gives_no_rate_of_an_imu_is_doubted(tmp_path, unit, doubted):
     """The header names another unit than the times have, which are of 100 Hz."""
@@ -376,6 +403,21 @@ def test_a_wider_table_without_header_gets_a_guess_to_confirm(tmp_path):
         read(tmp_path / "imu.csv")
     assert '# perhaps accel = ["column 2", "column 3", "column 4"]' in str(caught.value)
     assert '# perhaps gyro = ["column 5", "column 6", "column 7"]' in str(caught.value)
+
+
+def test_the_motion_shows_which_columns_of_a_wide_table_are_the_imu(tmp_path):
+    """As KAIST's xsens_imu.csv: time, quaternion, angles, gyro, accelerometer, magnetometer."""
+    t_s = np.arange(3000) * 0.01
+    turn = Rotation.from_euler("xyz", 0.8 * np.sin(t_s[:, None] * [0.9, 1.3, 0.7]))
+    noise = np.random.default_rng(3).normal(0.0, 0.002, (4, 3000, 3))
+    gyro = np.vstack([(turn[:-1].inv() * turn[1:]).as_rotvec() * 100.0, np.zeros(3)])
+    sensors = [gyro + noise[0], turn.inv().apply([0.0, 0.0, 9.8]) + noise[1], turn.inv().apply([0.2, 0.0, -0.4]) + noise[2]]
+    rows = np.column_stack([t_s, turn.as_quat(), turn.as_euler("xyz"), *sensors])
+    (tmp_path / "imu.csv").write_text("\n".join(",".join(map(repr, row)) for row in rows.tolist()) + "\n")
+    with pytest.raises(ConfigError) as caught:
+        read(tmp_path / "imu.csv")
+    assert '# perhaps accel = ["column 12", "column 13", "column 14"]' in str(caught.value)
+    assert '# perhaps gyro = ["column 9", "column 10", "column 11"]' in str(caught.value)
 
 
 def test_axes_in_letters_come_before_numbered_columns_of_the_same_word(tmp_path):
@@ -545,6 +587,55 @@ def test_every_unit_at_the_end_of_a_name_has_a_meaning():
     found = [split_name(f"x_{unit}") for unit in (*rates, *times)]
     assert [name for name, _ in found] == ["x"] * len(found)
     assert {unit for _, unit in found} == {"deg/s", "rad/s", "s", "ns", "us", "ms"}
+
+
+@pytest.mark.parametrize("kind", ["lists", "arrays", "structures"])
+def test_vectors_in_a_cell_of_parquet_are_columns(tmp_path, kind):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    gyro = COUNTS * 0.011
+
+    def cells(values: np.ndarray) -> pa.Array:
+        if kind == "structures":
+            return pa.array([dict(zip("xyz", row, strict=True)) for row in values.tolist()])
+        return pa.array(values.tolist(), pa.list_(pa.float64(), 3 if kind == "arrays" else -1))
+
+    columns = {"time_s": T_S, "gyro": cells(gyro), "accel": cells(9.8 * ACCEL_G), "words": [[1.0], [1.0, 2.0]] * (COUNT // 2)}
+    pq.write_table(pa.table(columns), tmp_path / "run.parquet")
+    log = table.read_sequence(table.sequences(tmp_path / "run.parquet")[0], mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_array_equal(log.imus["/imu0"].gyro, gyro)
+    np.testing.assert_array_equal(log.imus["/imu0"].accel, 9.8 * ACCEL_G)
+    assert log.remarks.losses == ["words is left out: its lists differ in length, or are empty"]
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("mark", [",", "\t", " "])
+def test_rows_of_arduinos_serial_monitor_begin_with_the_time_of_their_arrival(tmp_path, mark, own):
+    """The board's own time counts before it."""
+    late = [f"15:04:{5 + n // 100:02d}.{n % 100:02d}{n % 7} -> " for n in range(COUNT)]
+    values = np.column_stack([*([1000 + np.arange(COUNT) * 10] if own else []), ACCEL_G, COUNTS * 0.07]).round(4)
+    rows = [arrived + mark.join(f"{value:g}" for value in row) for arrived, row in zip(late, values.tolist(), strict=True)]
+    header = "15:04:04.999 -> " + mark.join([*(["millis"] if own else []), *NAMES[1:]])
+    (tmp_path / "monitor.txt").write_text("\n".join(["15:04:01.000 -> MPU ready", header, *rows]) + "\n")
+    imu = read(tmp_path / "monitor.txt").imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, np.deg2rad((COUNTS * 0.07).round(4)), rtol=1e-5)
+    assert imu.t_ns[0] == (10**9 if own else (15 * 3600 + 4 * 60 + 5) * 10**9)
+    assert (np.diff(imu.t_ns) == 10_000_000).all() == own
+
+
+def test_rows_that_name_no_kind_are_of_one_of_their_own(tmp_path):
+    """As the true poses in the JSON lines of Spectacular AI, between rows that name their sensor."""
+    rows = []
+    for n, t in enumerate(T_S.tolist()):
+        rows += [{"time": t, "sensor": {"type": "gyroscope", "values": (COUNTS[n] * 0.011).tolist()}}]
+        rows += [{"time": t, "sensor": {"type": "accelerometer", "values": (9.8 * ACCEL_G[n]).tolist()}}]
+        pose = {"position": {"x": t, "y": 0, "z": 0}, "orientation": {"w": 1, "x": 0, "y": 0, "z": 0}}
+        rows += [{"time": t, "groundTruth": pose}] * (n % 20 == 0)
+    (tmp_path / "data.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    log = table.read_sequence(table.sequences(tmp_path / "data.jsonl")[0], mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_allclose(log.poses["/ground_truth/pose"].p_wb[:, 0], T_S[::20])
+    assert log.remarks.losses == []
 
 
 def test_objects_without_a_number_are_no_table(tmp_path):

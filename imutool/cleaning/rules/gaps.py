@@ -14,6 +14,7 @@ from imutool.cleaning.samples import Samples
 from imutool.cleaning.stamp_line import batch_size, batch_words, bunched, lost_samples, usual_period
 from imutool.recording import nanoseconds
 from imutool.recording.columns import MOST_GAP_S
+from imutool.recording.sample_order import Ticked, ticked
 
 MISSING = "samples missing"
 MISSING_STEP = 1.5  # a step of this many median periods or more has lost samples
@@ -47,6 +48,7 @@ class Gaps(Rule):
         self.missing = 0
         self._last: tuple[int, int] | None = None
         self._period_ns = 0.0
+        self._coarse: Ticked | None = None
         self._within, self._steps = 0, 0  # a batch of stamps, and in all
         self._rows: list[Gap] = []
         self._pauses: list[Gap] = []
@@ -66,7 +68,8 @@ class Gaps(Rule):
             self._period_ns = usual_period(stamp)
         if not self._period_ns:
             return
-        lost = missing(stamp, self._period_ns)
+        self._coarse = ticked(stamp, self._coarse)
+        lost = missing(stamp, self._period_ns, self._coarse)
         lost = np.where(lost > 0, np.maximum(lost - (np.diff(number) - 1), 0), 0)
         for row in np.flatnonzero(steps > PAUSE_NS)[: MOST - len(self._pauses)]:
             self._pauses.append(Gap(int(number[row + 1]), int(stamp[row]), int(stamp[row + 1]), 0))
@@ -115,13 +118,15 @@ class Gaps(Rule):
         return gap._replace(missing=max(gap.missing - late, 0))
 
 
-def missing(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Int64[np.ndarray, " m"]:
+def missing(stamp_ns: Int64[np.ndarray, " n"], period_ns: float, coarse: Ticked | None = None) -> Int64[np.ndarray, " m"]:
     """Number of samples that are lost in each step.
 
-    0 for steps below 1.5 periods, for pauses, and where a stamp is late that those behind it make up for.
+    0 for steps below 1.5 periods, for those that a clock in `coarse` ticks makes, for pauses, and where a stamp is late that
+    those behind it make up for.
     """
     steps_ns = np.diff(stamp_ns)
-    return lost_samples(stamp_ns, period_ns, (steps_ns >= MISSING_STEP * period_ns) & (steps_ns <= PAUSE_NS))
+    is_long = steps_ns > coarse.period_ns if coarse else steps_ns >= MISSING_STEP * period_ns
+    return lost_samples(stamp_ns, period_ns, is_long & (steps_ns <= PAUSE_NS), coarse)
 
 
 def pause_words(steps_ns: Int64[np.ndarray, " n"]) -> list[str]:
