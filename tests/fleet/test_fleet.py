@@ -333,6 +333,7 @@ def test_a_killed_worker_takes_its_log_alone(
         killer.kill()
         killer.wait()
     assert told.startswith("log_")
+    assert not list(out.glob(".*.partial"))
     statuses = dict(report.progress.statuses)
     if workers == 1:
         assert statuses == {"ok": LOGS - 1, "failed": 1}
@@ -342,7 +343,6 @@ def test_a_killed_worker_takes_its_log_alone(
     else:
         assert statuses == {"ok": LOGS}
     assert digests(out) == expected
-    assert not list(out.glob(".*.partial"))
 
 
 ENDS = {"driver": signal.SIGKILL, "terminated": signal.SIGTERM, "Ctrl-C": signal.SIGINT}
