@@ -121,7 +121,7 @@ def debias(
     if pages:
         from imutool.viewing.html.drawing import require_matplotlib
 
-        require_matplotlib()
+        require_matplotlib("pages")
     start = {"init": init, "smooth": smooth, "force": force}
     settings = Settings(command="debias", model=model, **start, clean=clean, check=verify, pages=pages, imu=_one_or_more(imu))  # type: ignore[arg-type]
     return with_model_hash(settings)

@@ -27,6 +27,7 @@ from typer.testing import CliRunner
 
 from imutool.cleaning import CleaningSettings
 from imutool.cli import load
+from imutool.cli.fleet import debias as debias_words
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
 from imutool.file_location import to_location
@@ -244,6 +245,12 @@ def test_without_a_library_the_message_says_how_to_get_it(
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ConfigError, match=rf"needs {library}, which is not .*: pip install 'imutool\[fleet\]'"):
         run(str(fleet), str(tmp_path / "out"), INFO, lambda: RayEngine("auto"))
+
+
+def test_a_library_that_pages_need_is_named_with_their_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ConfigError, match="pages: matplotlib is not installed"):
+        debias_words(pages=True)
 
 
 def test_a_fleet_on_this_machine_opens_no_port(many: Path, engine: Workers, tmp_path: Path) -> None:
