@@ -71,6 +71,8 @@ def find(text: str, out: Location, *, bags: bool = False, once: bool = False) ->
     """
     endings = (LOG, BAG) if bags else (LOG,)
     root, files = _files(text, (*endings, *RAW))
+    if shown(root) != root:
+        raise ConfigError("has bytes in its path that are no UTF-8", where=shown(root), fix="Rename the folder")
     real = cache(_real)
     logs, refused, taken, passed_over, outputs = [], [], dict[str, str](), Counter[str](), 0
     for where, about, unread in files:

@@ -9,7 +9,7 @@ from typing import Literal
 import msgspec
 
 from imutool import __version__
-from imutool.errors import redact
+from imutool.errors import ConfigError, redact
 
 Command = Literal["debias", "repair", "info", "diagnose"]
 Status = Literal["ok", "lost", "failed", "quarantined", "skipped"]
@@ -46,8 +46,16 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of everything that decides the results, with the version of the tool."""
-        return _sha256(__version__, msgspec.json.encode(self).decode())
+        """SHA-256 of everything that decides the results, with the version of the tool.
+
+        Raises:
+            ConfigError: a path holds bytes that are no UTF-8, which no journal takes.
+        """
+        try:
+            return _sha256(__version__, msgspec.json.encode(self).decode())
+        except UnicodeEncodeError as error:
+            what = "a setting holds bytes that are no UTF-8"
+            raise ConfigError(what, where=self.sim or self.model, fix="Rename the file or folder") from error
 
 
 def with_model_hash(settings: Settings) -> Settings:

@@ -411,6 +411,15 @@ def test_the_command_says_what_came_of_it(fleet: Path, tmp_path: Path) -> None:
     assert report["not_whole"][0]["source"] == str(fleet / "bad.mcap")
 
 
+def test_a_path_that_is_no_utf_8_is_told(fleet: Path, tmp_path: Path) -> None:
+    odd = tmp_path / os.fsdecode(b"\xff")
+    odd.symlink_to(fleet)
+    for source, settings in ((odd, INFO), (fleet, Settings(command="diagnose", sim=str(odd)))):
+        with pytest.raises(ConfigError, match="are no UTF-8"):
+            run(str(source), str(tmp_path / "out"), settings, Inline)
+    assert not list((tmp_path / "out").rglob("*.json"))
+
+
 @pytest.mark.parametrize(
     ("words", "code", "why"),
     [

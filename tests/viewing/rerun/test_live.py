@@ -192,6 +192,14 @@ def test_a_command_without_its_file_ends_with_a_code(
     assert not (tmp_path / "live.rrd").exists()
 
 
+def test_a_path_that_rerun_does_not_take_is_told(log: Path, tmp_path: Path) -> None:
+    odd = tmp_path / os.fsdecode(b"\xff")
+    odd.mkdir()
+    with pytest.raises(ConfigError, match="which Rerun does not take"):
+        watched(log, tmp_path, save=odd / "live.rrd")
+    assert list(odd.iterdir()) == []
+
+
 def test_nothing_to_show_and_a_file_to_save_contradict(
     log: Path, tmp_path: Path, imutool: Callable[..., subprocess.CompletedProcess[str]]
 ) -> None:
