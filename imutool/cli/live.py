@@ -115,5 +115,5 @@ def _lines(stream: StreamStatistics, shown: list[Output]) -> list[str]:
         "samples without a measurement": stream.not_measured,
     }
     counts["samples not shown, as they came faster than they could be drawn"] = stream.not_shown
-    lines += [", ".join(f"{count} {what}" for what, count in counts.items() if count)] if any(counts.values()) else []
+    lines += [", ".join(f"{what}: {count}" for what, count in counts.items() if count)] if any(counts.values()) else []
     return [*lines, *(output.said for output in shown)]
