@@ -110,6 +110,13 @@ def location(path: object) -> Location:
     raise ConfigError(what, expected="a path or a URL", fix="`imutool.write` makes a log of arrays")
 
 
+def absolute(path: Path) -> Path:
+    """Absolute path without `..`, the same from every folder; a link keeps its name."""
+    if ".." not in path.parts:
+        return path.absolute()
+    return path.resolve() if path.name == ".." else path.parent.resolve() / path.name
+
+
 def log_name(where: Location) -> str:
     """Name of a log: that of its file without the suffix."""
     return unquote(where.stem) if str(where).startswith(WEB) else where.stem

@@ -20,6 +20,7 @@ from imutool.errors import ConfigError, redact
 from imutool.file_location import (
     WEB,
     Location,
+    absolute,
     exists,
     identity,
     io_errors,
@@ -163,10 +164,10 @@ def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
     if not isinstance(where, Path):
         return _in_store(text, endings)
     if is_folder(where):
-        root = where.absolute()
+        root = absolute(where)
         return str(root), _walk(root, endings, frozenset())
     if exists(where):
-        return str(where.absolute().parent), iter([_File(str(where.absolute()))])
+        return str(absolute(where).parent), iter([_File(str(absolute(where)))])
     if not PATTERN.search(str(where)):
         raise ConfigError("is not there", where=redact(text), expected="a log, a folder with logs, or a pattern")
     root = Path.cwd()
