@@ -167,7 +167,9 @@ def reason(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return redact(error.strerror)
     if isinstance(error, FileNotFoundError):
-        return "no such object, or no such bucket"
+        cause = error.__cause__  # fsspec says that of a web server which is away or refuses, too
+        is_away = isinstance(cause, OSError) or getattr(cause, "status", 404) != 404
+        return reason(cause) if isinstance(cause, Exception) and is_away else "no such object, or no such bucket"
     if isinstance(error, NotImplementedError):
         return "files of this kind of URL can only be read"
     if isinstance(error, PermissionError):
