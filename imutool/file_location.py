@@ -110,6 +110,13 @@ def location(path: object) -> Location:
     raise ConfigError(what, expected="a path or a URL", fix="`imutool.write` makes a log of arrays")
 
 
+def absolute(path: Path) -> Path:
+    """Absolute path without `..`, the same from every folder; a link keeps its name."""
+    if ".." not in path.parts:
+        return path.absolute()
+    return path.resolve() if path.name == ".." else path.parent.resolve() / path.name
+
+
 def log_name(where: Location) -> str:
     """Name of a log: that of its file without the suffix."""
     return unquote(where.stem) if str(where).startswith(WEB) else where.stem
@@ -160,7 +167,9 @@ def reason(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return redact(error.strerror)
     if isinstance(error, FileNotFoundError):
-        return "no such object, or no such bucket"
+        cause = error.__cause__  # fsspec says that of a web server which is away or refuses, too
+        is_away = isinstance(cause, OSError) or getattr(cause, "status", 404) != 404
+        return reason(cause) if isinstance(cause, Exception) and is_away else "no such object, or no such bucket"
     if isinstance(error, NotImplementedError):
         return "files of this kind of URL can only be read"
     if isinstance(error, PermissionError):

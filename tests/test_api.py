@@ -391,7 +391,8 @@ def test_a_channel_that_is_debiased_already_is_named(tmp_path: Path, caplog: pyt
 def test_results_print_briefly(logs: Path) -> None:
     log, model = logs / "flight_2.mcap", imutool.load_model(logs / "linear.safetensors")
     still = imutool.read(log).imu.rows(slice(0, 400))
-    results = imutool.clean(log), imutool.load_run(log, models=["static"]), imutool.bias_at_rest(model, still)
+    run = imutool.load_run(log, models=["static"])
+    results = imutool.clean(log), run, imutool.bias_at_rest(model, still), imutool.notebook_page(run)
     for result in (*results, imutool.OnlineDebiaser(model)):
         assert len(repr(result)) < 500
         assert "array(" not in repr(result)

@@ -29,7 +29,7 @@ from fuzz import bounded
 from fuzz.numbers import put_log
 from imutool.bias import model_file
 from imutool.cli.demo import write_asl
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, ModelError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.target import Target
@@ -407,6 +407,16 @@ def test_a_target_that_cannot_be_written_is_told(here: Path, imutool: Run, words
     done = imutool(*(word.format("file") for word in words), "-q", cwd=here)
     assert "file" in told(done, done.stderr, CONFIG)
     assert digests(here) == before
+
+
+def test_a_locked_model_is_no_missing_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(self: Path, *_: object, **__: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+
+    (tmp_path / "m.safetensors").touch()
+    monkeypatch.setattr(Path, "open", refused)
+    with pytest.raises(ModelError, match=r"m\.safetensors: cannot be read \(Permission denied\)"):
+        model_file.load(tmp_path / "m.safetensors")
 
 
 def test_a_target_the_system_refuses_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

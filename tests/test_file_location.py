@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -280,6 +281,13 @@ def test_a_web_server_that_sends_no_parts_is_named(tmp_path: Path) -> None:
         with pytest.raises(LogError, match="sends files as a whole and no part of one: fetch it first"):
             Source(to_location(f"http://127.0.0.1:{server.server_port}/large.mcap")).at(8 * MIB, 100)
         server.shutdown()
+
+
+def test_a_web_server_that_is_away_is_no_missing_object() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        url = f"http://127.0.0.1:{free.getsockname()[1]}/log.mcap"
+    with pytest.raises(ConfigError, match="Connect call failed"), Log(to_location(url)):
+        pass
 
 
 @pytest.mark.parametrize("words", [["train", "-o", "m.safetensors"], ["diagnose"]])

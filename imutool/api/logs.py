@@ -137,7 +137,7 @@ def convert(
         imu: Two topics that become one IMU: `gyro=TOPIC,accel=TOPIC`.
         fix: Correct units, axes and frames that the motion shows to be wrong.
         restamp: Put late stamps on the clock of the IMU.
-        workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
+        workers: Processes; by default one per core.
         progress: Callback with sequences done, sequences in all, and the name of the last one.
 
     Raises:

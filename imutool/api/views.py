@@ -119,7 +119,7 @@ def view(
         **options: Options of `load_run`: `models`, `init`, `smooth`, `imu`, `truth`, `align`, `findings`, `aid`.
 
     Returns:
-        One entry per output: `kind`, `address`, and a sentence, `said`.
+        One entry per output: `how`, `place`, and a sentence, `said`.
 
     Raises:
         ConfigError: Contradictory options, a file that exists, no viewer at `connect`, or Rerun is not installed.
@@ -128,8 +128,8 @@ def view(
     Examples:
         >>> import imutool
         >>> (page,) = imutool.view("flight_2.mcap", models=["linear.safetensors"], html="flight_2.html")
-        >>> print(page.said)
-        Wrote flight_2.html. Open it in a browser
+        >>> page.how, page.place, page.said
+        ('html', 'flight_2.html', 'Wrote flight_2.html. Open it in a browser')
     """
     given: list[Any] = several(logs)
     _check_options(options, given)

@@ -80,7 +80,7 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str
     """
     try:
         _refuse_size(path, MAX_BYTES)
-        with safe_open(path, framework="np") as file:
+        with path.open("rb"), safe_open(path, framework="np") as file:  # safe_open takes a locked file for a missing one
             header = file.metadata() or {}
             if header.get("format") != kind:
                 raise ModelError(

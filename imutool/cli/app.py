@@ -29,7 +29,8 @@ from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.report import Report
 
-NOTHING_LEFT = "Nothing half-written is left"
+NOTHING_LEFT, MAKE_ROOM = "Nothing half-written is left", "Choose another place or make room"
+FIXES = {FileNotFoundError: "Look whether it is still there", PermissionError: "See who may read it, or write there"}
 
 
 class _Commands(TyperGroup):
@@ -71,8 +72,7 @@ def caught() -> Iterator[None]:
         if error.filename is None:  # then it is a stream, and stdout the only one we fill
             _forget_stdout()
         place = f"{error.filename}: " if error.filename else ""
-        fix = "Look whether it is still there" if isinstance(error, FileNotFoundError) else "Choose another place or make room"
-        _fail(f"{place}{error.strerror or error}. {fix}.", ConfigError.exit_code)
+        _fail(f"{place}{error.strerror or error}. {FIXES.get(type(error), MAKE_ROOM)}.", ConfigError.exit_code)
     except Exception as error:
         if was_interrupted(error):
             _fail(f"interrupted. {NOTHING_LEFT}.", INTERRUPTED)

@@ -91,7 +91,8 @@ def debias(
             _draw(to_location(target or source), report.fits, report_to, common.overwrite)
         if not json_only:
             say(f"Report: {report_to}")
-    raise typer.Exit(LOST if report.lossy else 0)
+    unsaved = save_view is not None and watch is not None and all(output.how != "rrd" for output in watch.shown)
+    raise typer.Exit(LOST if report.lossy or unsaved else 0)
 
 
 def _require_matplotlib(report_to: Path | None) -> None:

@@ -138,6 +138,7 @@ def write_asl(recording: Recording, folder: Path) -> None:
     import numpy as np
 
     from imutool.exporting.euroc import IMU_COLUMNS, TRUTH_COLUMNS, TRUTH_FOLDER, rows
+    from imutool.mcap_io.storage.target import Target
 
     imu, truth = recording.imu, recording.truth
     assert truth.v_w is not None
@@ -149,4 +150,5 @@ def write_asl(recording: Recording, folder: Path) -> None:
         path = folder / "mav0" / name / "data.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
         lines = rows(t_ns.tolist(), np.concatenate(values, axis=1).tolist())
-        path.write_text(f"#{','.join(columns)}\n{''.join(lines)}", encoding="ascii")
+        with Target(path, overwrite=True) as table:
+            table.write(f"#{','.join(columns)}\n{''.join(lines)}".encode("ascii"))

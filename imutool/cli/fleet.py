@@ -121,7 +121,7 @@ def debias(
     if pages:
         from imutool.viewing.html.drawing import require_matplotlib
 
-        require_matplotlib()
+        require_matplotlib("pages")
     start = {"init": init, "smooth": smooth, "force": force}
     settings = Settings(command="debias", model=model, **start, clean=clean, check=verify, pages=pages, imu=_one_or_more(imu))  # type: ignore[arg-type]
     return with_model_hash(settings)
@@ -163,12 +163,12 @@ def diagnose(
     """Compare one kind of sensor on many robots: shared parameters and outliers."""
     from pathlib import Path
 
-    from imutool.file_location import to_location
+    from imutool.file_location import absolute, to_location
     from imutool.fleet.robots import robot_pattern
 
     robot_pattern(robot_from)
     place = None if sim is None else to_location(sim)
-    where = place.absolute() if isinstance(place, Path) else place
+    where = absolute(place) if isinstance(place, Path) else place
     return Settings(
         command="diagnose",
         sim=None if where is None else str(where),

@@ -67,6 +67,8 @@ def live(
     origin = source or log
     if origin is None or (source and log):
         raise ConfigError("one source is needed", where="live", expected="a log, or --from SOURCE")
+    if no_view and (save or connect):
+        raise ConfigError("--no-view shows nothing", where="--save, --connect", fix="Leave one of them out")
     if to_stdout and common.json_to == "-":
         raise ConfigError("--print and --json - both go to stdout", where="live", fix="Give --json a file")
     found = load_model(model)
@@ -80,6 +82,8 @@ def live(
     if not common.write(LiveReport(origin, model, stream, shown)):
         for line in _lines(stream, shown):
             say(line, to=err if to_stdout else out)
+    if save is not None and all(output.how != "rrd" for output in shown):
+        raise typer.Exit(ConfigError.exit_code)  # a warning has said why
 
 
 def _view(connect: str | None, save: Path | None, overwrite: bool) -> AbstractContextManager[Live]:
@@ -111,5 +115,5 @@ def _lines(stream: StreamStatistics, shown: list[Output]) -> list[str]:
         "samples without a measurement": stream.not_measured,
     }
     counts["samples not shown, as they came faster than they could be drawn"] = stream.not_shown
-    lines += [", ".join(f"{count} {what}" for what, count in counts.items() if count)] if any(counts.values()) else []
+    lines += [", ".join(f"{what}: {count}" for what, count in counts.items() if count)] if any(counts.values()) else []
     return [*lines, *(output.said for output in shown)]

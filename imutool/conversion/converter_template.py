@@ -8,6 +8,7 @@ from pathlib import Path
 from imutool import registry
 from imutool.conversion.workers import GROUP
 from imutool.errors import ConfigError
+from imutool.mcap_io.storage.target import FolderTarget, writing
 
 PROJECT = """\
 [build-system]
@@ -136,12 +137,11 @@ def write_template(name: str, folder: Path) -> list[Path]:
     if name in registry.names(GROUP):
         raise ConfigError(f"{name!r} is taken", where="name", expected=f"none of {', '.join(registry.names(GROUP))}")
     texts = {"pyproject.toml": PROJECT, f"imutool_{name}.py": MODULE, f"test_{name}.py": TEST}
-    try:
-        folder.mkdir(parents=True)
-        for file, text in texts.items():
-            (folder / file).write_text(text.replace("@NAME@", name), encoding="utf-8")
-    except FileExistsError:
-        raise ConfigError("exists", where=folder, fix="Choose another folder") from None
-    except OSError as error:
-        raise ConfigError(f"cannot be made ({error.strerror})", where=folder, expected="a writable place") from error
+    if folder.exists():
+        raise ConfigError("exists", where=folder, fix="Choose another folder")
+    with writing(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with FolderTarget(folder, folder, signed="", holds="", overwrite=False) as partial:
+            for file, text in texts.items():
+                (partial / file).write_text(text.replace("@NAME@", name), encoding="utf-8")
     return [folder / file for file in texts]

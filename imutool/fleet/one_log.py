@@ -18,7 +18,7 @@ from imutool.cleaning import UntrustedError
 from imutool.errors import LOST, ConfigError, ImutoolError, LogError, ModelError
 from imutool.file_location import Location, exists, identity, is_file, to_location
 from imutool.fleet.sources import simulation
-from imutool.fleet.targets import digest, is_current, page_name, partial_files, remove_files, within
+from imutool.fleet.targets import digest, is_current, page_name, remove_files, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.mcap_io.codec.joined_imu import parse_parts
 from imutool.mcap_io.log import Log
@@ -46,7 +46,7 @@ def work(task: Task, model: bytes | None = None) -> Result:
     """Run one task; an `ImutoolError` becomes a failed result, a bug is raised.
 
     `model` is the content of the model file, where the settings name one: this machine may not have it. The target is written
-    whole or not at all, and with the same bytes each time. Partial files of a killed attempt are removed.
+    whole or not at all, and with the same bytes each time.
     """
     began, cpu_began = time.perf_counter(), time.process_time()
     result = Result(
@@ -67,7 +67,8 @@ def work(task: Task, model: bytes | None = None) -> Result:
         if task.done is not None and is_current(task.done, job.target, whole=task.recheck):
             return msgspec.structs.replace(task.done, status="skipped", earlier=task.done.status)
         _refuse_changed(task, job.source)
-        _clear(task, job.target)
+        if isinstance(job.target, Path):
+            job.target.parent.mkdir(parents=True, exist_ok=True)
         entries = COMMANDS[task.settings.command](job)
         _refuse_changed(task, job.source, job.target)
         result = msgspec.structs.replace(result, **entries, target_bytes=identity(job.target)[0], **digest(job.target))
@@ -118,13 +119,6 @@ def _refuse_changed(task: Task, source: Location, made: Location | None = None) 
         if made is not None:
             remove_files([made])
         raise LogError("has changed since it was listed", where=source, fix="Go on with `resume` when it is complete")
-
-
-def _clear(task: Task, target: Location) -> None:
-    """Make the target's folder, and remove partial files of a killed attempt."""
-    if isinstance(target, Path):
-        target.parent.mkdir(parents=True, exist_ok=True)
-    remove_files(partial_files(to_location(task.out), [task.target, page_name(task.target)]))
 
 
 def _debias(job: _Job) -> dict[str, Any]:

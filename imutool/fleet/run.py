@@ -68,8 +68,7 @@ class Progress:
         parts += [
             f"{self.statuses[name]} {name}" for name in ("skipped", "lost", "quarantined", "failed") if self.statuses[name]
         ]
-        if running:
-            parts.append(f"{running} running")
+        parts += [f"{running} running"] if running else []
         if self.bytes_worked and elapsed > 0.0:
             speed = self.bytes_worked / elapsed
             parts.append(f"{speed / 1e6:.3g} MB/s")
@@ -169,6 +168,8 @@ def run(
             if isinstance(error, KeyboardInterrupt):
                 raise KeyboardInterrupt(f"{progress.line()}; go on with `resume`") from error
             raise
+        if isinstance(target, Path):  # of workers that died; in a store another run may be at work
+            fleet.remove_partial()
         return _report(fleet, journal, source, progress, began, page, wording)
 
 
@@ -178,9 +179,8 @@ def _report(
     """Write table, comparison and page from the results in the journal, read one by one."""
     settings, out = fleet.settings, fleet.out
     results.write(fleet.results(journal), out / results.NAME)
-    comparison = None
-    if settings.command == "diagnose":
-        comparison = compare(fleet.results(journal))
+    comparison = compare(fleet.results(journal)) if settings.command == "diagnose" else None
+    if comparison is not None:
         write_json(comparison.report(), out / COMPARED)
     seconds = time.perf_counter() - began
     if page is not None:

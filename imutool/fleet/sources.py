@@ -20,6 +20,7 @@ from imutool.errors import ConfigError, redact
 from imutool.file_location import (
     WEB,
     Location,
+    absolute,
     exists,
     identity,
     io_errors,
@@ -71,6 +72,8 @@ def find(text: str, out: Location, *, bags: bool = False, once: bool = False) ->
     """
     endings = (LOG, BAG) if bags else (LOG,)
     root, files = _files(text, (*endings, *RAW))
+    if shown(root) != root:
+        raise ConfigError("has bytes in its path that are no UTF-8", where=shown(root), fix="Rename the folder")
     real = cache(_real)
     logs, refused, taken, passed_over, outputs = [], [], dict[str, str](), Counter[str](), 0
     for where, about, unread in files:
@@ -161,10 +164,10 @@ def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
     if not isinstance(where, Path):
         return _in_store(text, endings)
     if is_folder(where):
-        root = where.absolute()
+        root = absolute(where)
         return str(root), _walk(root, endings, frozenset())
     if exists(where):
-        return str(where.absolute().parent), iter([_File(str(where.absolute()))])
+        return str(absolute(where).parent), iter([_File(str(absolute(where)))])
     if not PATTERN.search(str(where)):
         raise ConfigError("is not there", where=redact(text), expected="a log, a folder with logs, or a pattern")
     root = Path.cwd()

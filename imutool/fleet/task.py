@@ -9,7 +9,8 @@ from typing import Literal
 import msgspec
 
 from imutool import __version__
-from imutool.errors import redact
+from imutool.errors import ConfigError, redact
+from imutool.file_location import absolute
 
 Command = Literal["debias", "repair", "info", "diagnose"]
 Status = Literal["ok", "lost", "failed", "quarantined", "skipped"]
@@ -46,8 +47,16 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of everything that decides the results, with the version of the tool."""
-        return _sha256(__version__, msgspec.json.encode(self).decode())
+        """SHA-256 of everything that decides the results, with the version of the tool.
+
+        Raises:
+            ConfigError: a path holds bytes that are no UTF-8, which no journal takes.
+        """
+        try:
+            return _sha256(__version__, msgspec.json.encode(self).decode())
+        except UnicodeEncodeError as error:
+            what = "a setting holds bytes that are no UTF-8"
+            raise ConfigError(what, where=self.sim or self.model, fix="Rename the file or folder") from error
 
 
 def with_model_hash(settings: Settings) -> Settings:
@@ -62,7 +71,7 @@ def with_model_hash(settings: Settings) -> Settings:
 
     name = settings.model
     if name is not None and Path(name).suffix.lower() in {".safetensors", ".toml"}:
-        path = Path(name).absolute()
+        path = absolute(Path(name))
         if path.suffix.lower() == ".safetensors":
             find_model(path)  # before a thousand logs say the same
         return msgspec.structs.replace(settings, model=str(path), model_sha256=digest(path))

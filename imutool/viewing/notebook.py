@@ -13,7 +13,7 @@ from __future__ import annotations
 import html
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
@@ -60,7 +60,7 @@ def show(logs: Sequence[RunData], *, source: bool = True) -> Viewer:
 class Page:
     """HTML page that a notebook shows in a sandboxed frame."""
 
-    content: str
+    content: str = field(repr=False)
 
     def _repr_html_(self) -> str:
         style = f"width: 100%; height: {HEIGHT_PX}px; border: 0"

@@ -302,6 +302,17 @@ def test_a_full_disk_leaves_nothing(
     assert digests(brief) == before
 
 
+@pytest.mark.parametrize("words", [["demo", "-o", "out"], ["new-converter", "mine", "-o", "out"]], ids=lambda words: words[0])
+def test_a_full_disk_leaves_no_part_of_a_text(
+    tmp_path: Path, imutool: Run, full_disk: Callable[[], contextlib.AbstractContextManager[None]], words: list[str]
+) -> None:
+    with full_disk():
+        done = imutool(*words, cwd=tmp_path)
+    assert done.returncode == CONFIG, done.stderr
+    assert "cannot be written (File too large)" in done.stderr
+    assert digests(tmp_path) == {}
+
+
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_locked_folder_is_refused(brief: Path, imutool: Run, name: str) -> None:
     """Not even root makes a file in /proc."""

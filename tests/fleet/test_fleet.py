@@ -27,6 +27,7 @@ from typer.testing import CliRunner
 
 from imutool.cleaning import CleaningSettings
 from imutool.cli import load
+from imutool.cli.fleet import debias as debias_words
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
 from imutool.file_location import to_location
@@ -246,6 +247,12 @@ def test_without_a_library_the_message_says_how_to_get_it(
         run(str(fleet), str(tmp_path / "out"), INFO, lambda: RayEngine("auto"))
 
 
+def test_a_library_that_pages_need_is_named_with_their_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ConfigError, match="pages: matplotlib is not installed"):
+        debias_words(pages=True)
+
+
 def test_a_fleet_on_this_machine_opens_no_port(many: Path, engine: Workers, tmp_path: Path) -> None:
     listening: set[str] = set()
     before = set(below(os.getpid()))  # a cluster of other tests listens
@@ -333,6 +340,7 @@ def test_a_killed_worker_takes_its_log_alone(
         killer.kill()
         killer.wait()
     assert told.startswith("log_")
+    assert not list(out.glob(".*.partial"))
     statuses = dict(report.progress.statuses)
     if workers == 1:
         assert statuses == {"ok": LOGS - 1, "failed": 1}
@@ -342,7 +350,6 @@ def test_a_killed_worker_takes_its_log_alone(
     else:
         assert statuses == {"ok": LOGS}
     assert digests(out) == expected
-    assert not list(out.glob(".*.partial"))
 
 
 ENDS = {"driver": signal.SIGKILL, "terminated": signal.SIGTERM, "Ctrl-C": signal.SIGINT}
@@ -402,6 +409,15 @@ def test_the_command_says_what_came_of_it(fleet: Path, tmp_path: Path) -> None:
     report = json.loads(done.stdout)
     assert (report["schema"], report["statuses"]) == ("imutool.fleet/1", {"failed": 1, "skipped": 2})
     assert report["not_whole"][0]["source"] == str(fleet / "bad.mcap")
+
+
+def test_a_path_that_is_no_utf_8_is_told(fleet: Path, tmp_path: Path) -> None:
+    odd = tmp_path / os.fsdecode(b"\xff")
+    odd.symlink_to(fleet)
+    for source, settings in ((odd, INFO), (fleet, Settings(command="diagnose", sim=str(odd)))):
+        with pytest.raises(ConfigError, match="are no UTF-8"):
+            run(str(source), str(tmp_path / "out"), settings, Inline)
+    assert not list((tmp_path / "out").rglob("*.json"))
 
 
 @pytest.mark.parametrize(

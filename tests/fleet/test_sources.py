@@ -17,7 +17,7 @@ from imutool.errors import ConfigError
 from imutool.file_location import identity, to_location
 from imutool.fleet.sources import Found, find, with_simulations
 from imutool.fleet.targets import LONGEST
-from imutool.fleet.task import Settings
+from imutool.fleet.task import Settings, with_model_hash
 
 NOWHERE = Path("/nowhere")
 
@@ -40,6 +40,17 @@ def test_logs_of_the_same_name_keep_their_folders(tmp_path: Path) -> None:
     assert names(tmp_path / "a" / "log.mcap") == ["log.mcap"]
     assert names(tmp_path / "*" / "log.mcap") == ["a/log.mcap", "b/log.mcap"]
     assert names(tmp_path / "b" / "**" / "*.mcap") == ["c/log.mcap", "log.mcap"]
+
+
+def test_logs_and_a_model_are_the_same_from_another_folder(tmp_path: Path, logs: Path) -> None:
+    """Else `resume` does all logs again, or refuses its own model."""
+    tree(tmp_path, "a/log.mcap", "b/c/log.mcap")
+    for place in ("a", "a/log.mcap", "b/.."):
+        assert find(str(tmp_path / "b" / ".." / place), NOWHERE).logs == find(str(tmp_path / place), NOWHERE).logs
+    (tmp_path / "b" / "latest.safetensors").symlink_to(logs / "linear.safetensors")
+    models = (tmp_path / "b" / way / "latest.safetensors" for way in (".", "c/.."))
+    first, second = (with_model_hash(Settings(command="debias", model=str(model))) for model in models)
+    assert first == second
 
 
 def test_endings_in_capital_letters_are_endings(tmp_path: Path) -> None:

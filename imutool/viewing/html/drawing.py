@@ -183,13 +183,13 @@ def plain_tick_labels(*rulers: Any) -> None:
         ruler.set_minor_formatter(NullFormatter())
 
 
-def require_matplotlib() -> Any:
+def require_matplotlib(where: str = "report") -> Any:
     """Import matplotlib at its first use.
 
     Raises:
         ConfigError: it is not installed.
     """
-    return required("matplotlib", "report", where="report")
+    return required("matplotlib", "report", where=where)
 
 
 @contextmanager

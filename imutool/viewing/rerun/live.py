@@ -108,7 +108,11 @@ class Live:
     def record(self, path: Path, temporary: Path) -> None:
         """Write everything to `temporary` too, which will become `path`."""
         self._file = new_stream(self._name)
-        self._file.save(temporary)
+        try:
+            self._file.save(temporary)
+        except UnicodeEncodeError as error:
+            what = "has bytes in its path that are no UTF-8, which Rerun does not take"
+            raise ConfigError(what, where=path, fix="Choose another place") from error
         self.shown.append(Output("rrd", str(path), f"{self.trouble}Saved {path}. Open with: rerun {quote(str(path))}"))
 
     def __call__(self, block: DebiasedBlock) -> None:

@@ -86,6 +86,7 @@ class _Session:
         self._delays: list[float] = []
         self._random = np.random.default_rng(0)
         self._begin_ns = self._last_ns = -1
+        self._gap_ns = 0  # in which no sample came: the rate is that of the others
         self._ready_s = np.inf  # time of arrival from which on delays count: what came before waited for the start
         self._samples = self._gaps = self._out_of_order = self._not_measured = 0
         self._bias = np.zeros(6)
@@ -128,11 +129,11 @@ class _Session:
         if not self._samples:
             why = f"; the first of {malformed.count} messages: {malformed.first}" if malformed.count else ""
             raise DataError(f"it sent no samples{why}", where=STREAM, expected='{"t_ns": …, "gyro": […], "accel": […]}')
-        seconds = (self._last_ns - self._begin_ns) * 1e-9
+        steps, steady_ns = self._samples - 1 - self._gaps, self._last_ns - self._begin_ns - self._gap_ns
         return StreamStatistics(
             samples=self._samples,
-            seconds=seconds,
-            rate_hz=(self._samples - 1) / seconds if seconds > 0.0 else 0.0,
+            seconds=(self._last_ns - self._begin_ns) * 1e-9,
+            rate_hz=steps / (steady_ns * 1e-9) if steady_ns > 0 else 0.0,
             delay_ms=self._delay(),
             start=self._how,
             fit=self._fitness,
@@ -164,7 +165,7 @@ class _Session:
         elif step_ns <= 0:
             self._out_of_order += 1
         elif step_ns > GAP_S * 1e9:
-            self._gaps += 1
+            self._gaps, self._gap_ns = self._gaps + 1, self._gap_ns + step_ns
         self._last_ns = max(self._last_ns, found.stamp_ns) if self._samples and not jumps else found.stamp_ns
         self._samples += 1
         return bool(jumps)

@@ -155,9 +155,9 @@ def test_what_cannot_be_shown_does_not_stop_the_debiasing(
     assert not (tmp_path / "live.rrd").exists()
 
 
-def test_a_file_that_lost_its_end_is_no_file(
-    log: Path, unwatched: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+@pytest.fixture
+def lost_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the .rrd file is lost, as on a full disk."""
     finish = live.Live.finish
 
     def and_lose_the_end(self: live.Live) -> None:
@@ -166,12 +166,45 @@ def test_a_file_that_lost_its_end_is_no_file(
         os.truncate(partial, partial.stat().st_size // 2)
 
     monkeypatch.setattr(live.Live, "finish", and_lose_the_end)
+
+
+@pytest.mark.usefixtures("lost_end")
+def test_a_file_that_lost_its_end_is_no_file(
+    log: Path, unwatched: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     with caplog.at_level(logging.WARNING, "imutool"):
         out, watch = watched(log, tmp_path, save=tmp_path / "live.rrd")
     assert len(caplog.records) == 1
     assert "could not be written completely" in caplog.text
     assert (watch.shown, [path.name for path in tmp_path.iterdir()]) == ([], ["out.mcap"])
     assert out.read_bytes() == unwatched.read_bytes()
+
+
+@pytest.mark.usefixtures("lost_end")
+@pytest.mark.parametrize(
+    "words", [["debias", "{}", "out.mcap", "--save-view", "live.rrd"], ["live", "{}", "--speed", "100", "--save", "live.rrd"]]
+)
+def test_a_command_without_its_file_ends_with_a_code(
+    log: Path, tmp_path: Path, imutool: Callable[..., subprocess.CompletedProcess[str]], words: list[str]
+) -> None:
+    done = imutool(*(word.format(log) for word in words), cwd=tmp_path)
+    assert (done.returncode, "written completely" in done.stderr) == (3, True), done.stderr
+    assert not (tmp_path / "live.rrd").exists()
+
+
+def test_a_path_that_rerun_does_not_take_is_told(log: Path, tmp_path: Path) -> None:
+    odd = tmp_path / os.fsdecode(b"\xff")
+    odd.mkdir()
+    with pytest.raises(ConfigError, match="which Rerun does not take"):
+        watched(log, tmp_path, save=odd / "live.rrd")
+    assert list(odd.iterdir()) == []
+
+
+def test_nothing_to_show_and_a_file_to_save_contradict(
+    log: Path, tmp_path: Path, imutool: Callable[..., subprocess.CompletedProcess[str]]
+) -> None:
+    done = imutool("live", log, "--no-view", "--save", "live.rrd", cwd=tmp_path)
+    assert (done.returncode, "--no-view shows nothing" in done.stderr) == (3, True), done.stderr
 
 
 def test_samples_that_come_again_from_a_repaired_log_are_shown_once(log: Path, tmp_path: Path) -> None:

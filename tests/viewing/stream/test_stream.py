@@ -113,6 +113,7 @@ def test_gaps_order_and_missing_values_are_counted_and_do_no_harm(imu: Imu) -> N
     shown: list[Any] = []
     done = run(iter([None, *rows]), api.load_model("static"), Malformed(), show=shown.append)
     assert (done.gaps, done.out_of_order, done.not_measured) == (1, 1, 1)
+    assert done.rate_hz == pytest.approx(1.0 / imu.period_s, rel=0.01)  # not less for the gap
     stamps = np.concatenate([block.batch.stamp_ns for block in shown])
     assert len(stamps) == len(imu) - 2
     assert (np.diff(stamps) > 0).all()
