@@ -99,7 +99,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     most = np.full(6, MOST_DEVIATIONS) if prior.least is None else MOST_OF_GUESS
     share = share_of_correction(none.innovations, unstarted.innovations)
     confirmed = HALF < share.value - SURE * share.std < MOST_SHARE
-    other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean)
+    other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean, confirmed=confirmed)
     other_bias, refuted = list(_other_bias(found, prior, most)), list(_refuted(share))
     contradictions = [*other_axes, *other_bias, *_disagreement(found, none), *refuted]
     if harmful or contradictions:

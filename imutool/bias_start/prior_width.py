@@ -114,13 +114,18 @@ def shown_bias(
     return (bias - mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)
 
 
-def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, most_left: float = MOST_LEFT) -> list[str]:
+def turned_axes(
+    difference: Vector6, std: Vector6, mean: Vector6, most_left: float = MOST_LEFT, *, confirmed: bool = False
+) -> list[str]:
     """Sentence on a log whose bias is clearly that of the training runs in turned axes.
 
-    A correction of scales is the same in axes that are turned by half a turn, so the share of it says nothing. `most_left` is
-    the share of chi-square that turned axes leave at most: less, where few logs show how much the bias changes by itself.
+    A correction of scales is the same in axes that are turned by half a turn, so the share of it says nothing about these. If
+    it is `confirmed`, there are no other turns. `most_left` is the share of chi-square that turned axes leave at most: less,
+    where few logs show how much the bias changes by itself.
     """
     rotations = signed_permutations()[np.linalg.det(signed_permutations()) > 0.0]  # the identity first
+    if confirmed:
+        rotations = rotations[(np.abs(rotations) == np.eye(3)).all(axis=(1, 2))]
     turned = (rotations[:, None] @ mean.reshape(2, 3, 1)).reshape(-1, 6)
     chi_square = (((mean + difference - turned) / std) ** 2).sum(axis=1)
     best = int(np.argmin(chi_square))
