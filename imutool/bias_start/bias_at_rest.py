@@ -31,6 +31,7 @@ from imutool.bias_start.initial_bias import (
 from imutool.bias_start.prior_width import MOST_DEVIATIONS, BiasPrior, supported_std, widened
 from imutool.errors import DataError
 from imutool.inertial.inertial_filter import LEAST_FORCE_M_S2
+from imutool.inertial.innovations import LEAST_DRIVEN_M_S
 from imutool.inertial.stationary import Blocks, rest_stretches, resting_blocks, white_noise
 from imutool.recording import GRAVITY_M_S2, Imu, nanoseconds
 
@@ -146,17 +147,23 @@ def over_all_rest(model: BiasModel, blocks: Blocks) -> InitialBias:
 
 
 def rest_differences(
-    model: BiasModel, logs: Sequence[Samples], rest: Float64[np.ndarray, "logs 6"]
+    model: BiasModel,
+    logs: Sequence[Samples],
+    rest: Float64[np.ndarray, "logs 6"],
+    velocities: Sequence[Float64[np.ndarray, "_ 3"]] | None = None,
 ) -> list[Float64[np.ndarray, "_ 6"]]:
     """Bias at each stop of each log minus the log's bias in motion, `rest`.
 
-    Rest shows the accelerometer's bias along gravity only, so its three columns are the same.
+    Rest shows the accelerometer's bias along gravity only, so its three columns are the same. With true `velocities` a
+    steady drive is no stop.
     """
     out = []
-    for (t_s, gyro, accel), in_motion in zip(logs, rest, strict=True):
+    for log, ((t_s, gyro, accel), in_motion) in enumerate(zip(logs, rest, strict=True)):
         t_ns = np.round(t_s * 1e9).astype(np.int64)
         residual = np.concatenate([gyro, accel], axis=1) - model.stream(in_motion)(t_s, gyro, accel)
-        means = [residual[first:last].mean(axis=0) for first, last in rest_stretches(Imu(t_ns, gyro, accel))]
+        stands = np.ones(len(t_s), bool) if velocities is None else np.linalg.norm(velocities[log], axis=1) < LEAST_DRIVEN_M_S
+        stops = [np.arange(first, last)[stands[first:last]] for first, last in rest_stretches(Imu(t_ns, gyro, accel))]
+        means = [residual[stop].mean(axis=0) for stop in stops if len(stop)]
         out.append(np.array([[*m[:3], *[np.linalg.norm(m[3:]) - GRAVITY_M_S2] * 3] for m in means]).reshape(-1, 6))
     return out
 

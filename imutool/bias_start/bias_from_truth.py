@@ -40,6 +40,7 @@ JUMP_RAD, JUMP_MEDIANS, JUMP_SHARE = np.deg2rad(5.0), 10.0, 0.2  # as `imutool i
 BRIDGED_S = 2.0  # longest gap of the poses over which turns are compared: of a wrong pose between gaps both jumps count
 LOST = 2.5  # median periods, beyond which samples are lost
 MOUNT_STD = 0.05  # rad: plausible rotation of markers that were meant to be straight
+OWN_MOUNT_STD = 0.005  # rad: of a log's markers against those of the training logs, which the model knows
 SAME = 100.0  # samples whose poses have the same error
 PARTS, CONTRADICTED = 3, 22.5  # of a start; chi-square of their scatter on three axes, exceeded once in a thousand usual starts
 LEAST_TRUTH_STD = np.array([5e-5] * 3 + [2e-3] * 3)  # rad/s and m/s²: no poses show a bias better
@@ -77,7 +78,7 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     start = prior(model, int(imu.t_ns[0]))
     residual = np.concatenate([piece.gyro, piece.accel], axis=1) - model.stream(start.rest)(*relative_samples(piece))
     alone = poses_turn_alone(replace(piece, gyro=residual[:, :3]), truth)
-    mount_std = 0.0 if model.card else MOUNT_STD  # a trained model knows it
+    mount_std = OWN_MOUNT_STD if model.card else MOUNT_STD
     q, v_w, known = quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows]
     parts = [np.arange(len(t[rows])), *np.array_split(np.arange(len(t[rows])), PARTS)]
     offset, *thirds = [

@@ -1,6 +1,4 @@
-"""Rest bias tracked through a log.
-
-Causally from earlier samples, or smoothed from the whole log.
+"""Rest bias tracked through a log: causally, or smoothed from the whole log.
 
 Samples, minus the model's motion-dependent bias, go through `imutool.inertial.inertial_filter` in blocks of half a second.
 """
@@ -19,6 +17,7 @@ from imutool.bias.model import GAP_S, BiasEstimate, BiasModel
 from imutool.bias_start.prior_width import MOST_CHANGE, MOST_DEVIATIONS, BiasPrior
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State, Step
+from imutool.inertial.innovations import DriveDetector
 from imutool.inertial.preintegration import integrate
 from imutool.inertial.stationary import GAP_PERIODS, OnlineRestDetector
 from imutool.recording.columns import quantile
@@ -90,7 +89,7 @@ class BiasFilter:
         self.state: State | None = None
         self._aiding = aiding
         self._walk = prior.walk if aiding is None else np.concatenate([prior.walk, aiding.walk])
-        self._prior, self._rest_detector = prior, OnlineRestDetector()
+        self._prior, self._rest_detector, self._drives = prior, OnlineRestDetector(), DriveDetector()
         self._wait = self._rest_detector.blocks_needed - 1 if ahead else 0
         self._waiting: deque[tuple[_Block, bool]] = deque()
         self._pending: list[tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 6"]]] = []
@@ -158,6 +157,8 @@ class BiasFilter:
             step = inertial_filter.reset_pose(x, u[-1, 3:], T, self._prior.walk, most, s)
         else:
             step = _step(x, block, rests, self._walk, s)
+            if rests and self._drives(block.u[:-1], step):
+                rests, step = False, _step(x, block, False, self._walk, s)
         if self._aiding is not None:
             step = step._replace(after=self._aiding.measure(step.after, float(t[-1])))
         self.state = step.after
@@ -179,7 +180,7 @@ def _step(x: State, block: _Block, resting: bool, walk: Float64[np.ndarray, " _"
 def filter_together(filters: Sequence[BiasFilter], samples: Sequence[Samples]) -> list[list[FilteredBlock]]:
     """Filtered blocks of new filters of equal walk and settings, each of its own samples.
 
-    The samples have the same times. Where all filters move, or all rest, numpy takes half as long as for one after the other.
+    The samples have the same times. Where all filters move, numpy takes half as long as for one after the other.
     """
     own = {id(of): (each, of) for each, of in zip(filters, samples, strict=True)}  # several may have the same samples
     ready = {key: [*each._ready(of), *each._waiting] for key, (each, of) in own.items()}
@@ -187,14 +188,13 @@ def filter_together(filters: Sequence[BiasFilter], samples: Sequence[Samples]) -
     for blocks in zip(*(ready[id(of)] for of in samples), strict=True):
         first, states = blocks[0][0], [each.state for each in filters if each.state is not None]
         rest = {rests and each._rests(block) for each, (block, rests) in zip(filters, blocks, strict=True)}
-        if len(rest) > 1 or len(states) < len(filters) or first.longest_s > GAP_S:
+        if True in rest or len(states) < len(filters) or first.longest_s > GAP_S:
             found = [each._pass(*block) for each, block in zip(filters, blocks, strict=True)]
         else:
             x = State(*map(np.array, zip(*(vars(state).values() for state in states), strict=True)))
             together = first._replace(u=np.stack([block.u for block, _ in blocks], axis=1))
-            resting, t_s = rest.pop(), first.t_s
-            step = _step(x, together, resting, filters[0]._walk, filters[0].settings)
-            found = [FilteredBlock(float(t_s[0]), float(t_s[-1]), resting, step.of(k)) for k in range(len(filters))]
+            step = _step(x, together, False, filters[0]._walk, filters[0].settings)
+            found = [FilteredBlock(first.t_s[0].item(), first.t_s[-1].item(), False, step.of(k)) for k in range(len(filters))]
         for each, so_far, block in zip(filters, out, found, strict=True):
             each.state = block.step.after
             so_far.append(block)

@@ -10,8 +10,7 @@ Where one of the three fails, the likelihood of the innovations is compared with
 bias: the model is unfit if even from its start in this log it explains the samples worse than no model, if the log asks for the
 opposite of its correction, or if its bias and its correction are both another unit's.
 
-The thresholds come from `tests/bench/fit.py`, on pieces of the training logs of the models that ship and on logs of other
-sensors, and from made-up sensors as those of `tests/bench/units.py`.
+The thresholds come from `tests/bench/fit.py`, and from made-up sensors as those of `tests/bench/units.py`.
 """
 
 from __future__ import annotations
@@ -34,6 +33,8 @@ from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias,
 from imutool.bias_start.prior_width import (
     MOST_CHANGE,
     MOST_DEVIATIONS,
+    MOST_LEFT,
+    MOST_LEFT_OF_ONE,
     BiasPrior,
     contradicted_start,
     supported_std,
@@ -99,7 +100,8 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     most = np.full(6, MOST_DEVIATIONS) if prior.least is None else MOST_OF_GUESS
     share = share_of_correction(none.innovations, unstarted.innovations)
     confirmed = HALF < share.value - SURE * share.std < MOST_SHARE
-    other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean)
+    most_left = MOST_LEFT_OF_ONE if len(model.card.get("sessions", ())) == 1 else MOST_LEFT
+    other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean, most_left, confirmed=confirmed)
     other_bias, refuted = list(_other_bias(found, prior, most)), list(_refuted(share))
     contradictions = [*other_axes, *other_bias, *_disagreement(found, none), *refuted]
     if harmful or contradictions:

@@ -25,6 +25,7 @@ SAME_WIDTH = 1e-6  # share of a variance by which a narrower prior differs at le
 SHARES = np.linspace(0.0, 1.0, 25)[:, None]  # of the way from the least width of a prior to the most, in equal ratios
 TURNED = 20.0  # chi-square that turned axes leave at most, and by which they are better
 MOST_LEFT = 0.2  # share of chi-square that turned axes leave; of sensors that were turned up to 0.16, by chance 0.28
+MOST_LEFT_OF_ONE = 0.12  # the same by one session, whose turn-on bias says little of the next: TUM-VI's turned axes up to 0.11
 CONTRADICTED = (np.inf, 10.8, 13.8, 16.3)  # chi-square of as many differences; a true prior exceeds it once in a thousand logs
 
 
@@ -114,13 +115,18 @@ def shown_bias(
     return (bias - mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)
 
 
-def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, most_left: float = MOST_LEFT) -> list[str]:
+def turned_axes(
+    difference: Vector6, std: Vector6, mean: Vector6, most_left: float = MOST_LEFT, *, confirmed: bool = False
+) -> list[str]:
     """Sentence on a log whose bias is clearly that of the training runs in turned axes.
 
-    A correction of scales is the same in axes that are turned by half a turn, so the share of it says nothing. `most_left` is
-    the share of chi-square that turned axes leave at most: less, where few logs show how much the bias changes by itself.
+    A correction of scales is the same in axes that are turned by half a turn, so the share of it says nothing about these. If
+    it is `confirmed`, there are no other turns. `most_left` is the share of chi-square that turned axes leave at most: less,
+    where few logs show how much the bias changes by itself.
     """
     rotations = signed_permutations()[np.linalg.det(signed_permutations()) > 0.0]  # the identity first
+    if confirmed:
+        rotations = rotations[(np.abs(rotations) == np.eye(3)).all(axis=(1, 2))]
     turned = (rotations[:, None] @ mean.reshape(2, 3, 1)).reshape(-1, 6)
     chi_square = (((mean + difference - turned) / std) ** 2).sum(axis=1)
     best = int(np.argmin(chi_square))

@@ -1,4 +1,4 @@
-"""Innovations of the filter's velocity, and the share of a correction they ask for."""
+"""Innovations of velocity: the share of a correction they ask for, stops they refute."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from imutool.inertial.inertial_filter import Step
 STUDENT = 7.0  # degrees of freedom of the likelihood, so that one jolt does not decide
 SURPRISING = 7.81  # chi-square of three that one innovation in twenty exceeds: above, it gets less weight
 LAGS = 6  # blocks over which innovations depend on each other: the bounded velocity is no white noise
+MOST_SHAKING = 2.0  # noise of a block at rest, by that of the calmest stop before; idling motors have up to nine times that
+LEAST_DRIVEN_M_S, DRIVEN = 0.5, 11.3  # speed, and its chi-square, which a body at rest exceeds once in a hundred times
+DRIVEN_M_S = 2.0  # speed that is no error of the filter
 
 
 class Innovations(NamedTuple):
@@ -39,6 +42,27 @@ def innovations(steps: Iterable[Step]) -> Innovations:
     measured = [(step.expected.R_wb.T, *step.innovation) for step in steps if step.innovation is not None]
     R_bw, v, S = (np.array([row[k] for row in measured]).reshape(-1, *shape) for k, shape in enumerate(((3, 3), (3,), (3, 3))))
     return Innovations((R_bw @ v[..., None])[..., 0], R_bw @ S @ R_bw.transpose(0, 2, 1))
+
+
+class DriveDetector:
+    """Detector of steady drives among blocks that look like rest.
+
+    A body that drives shakes more than at a stop before, and by the filter has speed: on a straight road the gyro shows nothing
+    else, and an engine hides that its rate is not constant.
+    """
+
+    def __init__(self) -> None:
+        self._calmest = np.full(2, np.inf)
+
+    def __call__(self, samples: Float64[np.ndarray, "n 6"], step: Step) -> bool:
+        """Whether a body drives, from the samples of a block and the filter's step of it at rest."""
+        noise = np.sqrt(samples.var(axis=0).reshape(2, 3).sum(axis=1))
+        shakes, self._calmest = bool((noise > MOST_SHAKING * self._calmest).any()), np.minimum(noise, self._calmest)
+        if not shakes or step.innovation is None:
+            return False
+        v_w, S = step.innovation
+        speed = float(np.linalg.norm(v_w))
+        return speed > DRIVEN_M_S or bool(speed > LEAST_DRIVEN_M_S and v_w @ np.linalg.solve(S, v_w) > DRIVEN)
 
 
 class Share(NamedTuple):

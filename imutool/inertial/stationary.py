@@ -25,7 +25,7 @@ from msgspec import Meta
 from imutool.array_types import Bool, Float64, Int64
 from imutool.config import Settings
 from imutool.recording import Imu, nanoseconds
-from imutool.recording.columns import median, quantile, true_ranges
+from imutool.recording.columns import quantile, true_ranges
 
 WHITE_MARGIN = 1.3  # ratio of block means to white noise; with 10 blocks of 3 axes, equally noisy, it scatters by 0.14
 LEAST_VARIANCE = 1e-300  # of a window that is stuck
@@ -37,7 +37,11 @@ CALM = 1.2  # times `white_noise`, that pure white noise is
 MEANS, LEAST_MEANS = (20, 200), 8  # samples of a mean of noise, and how many means there are at least
 TOLERATED_MEAN = 1.8  # by which they may scatter more than noise is measured, which finds five sixths of it
 MOST_DRIFT = np.array([0.1] * 3 + [0.5] * 3)  # rad/s, m/s²: plausible sizes of a bias and of its drift
-KEPT_MEANS = 100  # of windows at rest, for their median
+KEPT_MEANS, COMPARED_MEANS = 1000, 100  # of windows at rest: kept by a live detector, and compared with each other
+REPEATED_RAD_S, OFTEN = (
+    4e-3,
+    0.25,
+)  # means that are alike; a rate that repeats a quarter as often as the commonest may be the bias
 GAP_PERIODS = 3.0  # a longer step between samples breaks a window
 
 AT_ONCE = 1 << 14  # windows
@@ -47,10 +51,7 @@ Positive = Annotated[float, Meta(gt=0)]
 
 
 class StationarySettings(Settings, frozen=True, kw_only=True):
-    """Settings of rest detection.
-
-    Lengths of blocks, windows and stretches, and caps of a resting sensor.
-    """
+    """Settings of rest detection: lengths, and caps of a resting sensor."""
 
     block_s: Positive = 0.1
     window_s: Positive = 1.0
@@ -60,15 +61,12 @@ class StationarySettings(Settings, frozen=True, kw_only=True):
     gyro_noise_rad_s: Positive = 0.1  # within blocks; EuRoC's idling motors reach 0.085
     accel_noise_m_s2: Positive = 1.5
     gyro_mean_rad_s: Positive = 0.2  # a larger mean is a turn, not a bias (11 degrees a second)
-    gyro_agreement_rad_s: Positive = 0.02  # between a window's mean and the median of all that rest
+    gyro_agreement_rad_s: Positive = 0.02  # between a window's mean and the rate at rest
     gyro_trend_rad_s: Positive = 2e-3  # between the means of a window's halves, beside four deviations of their noise
 
 
 class Blocks(NamedTuple):
-    """Block statistics of samples in blocks of `k`.
-
-    113 bytes per block, 4 MB per hour at any rate.
-    """
+    """Block statistics of samples in blocks of `k`: 4 MB per hour at any rate."""
 
     k: int
     period_s: float
@@ -80,10 +78,7 @@ class Blocks(NamedTuple):
 
 
 def block_statistics(batches: Iterable[Batch], period_s: float, settings: StationarySettings | None = None) -> Blocks:
-    """Block statistics of batches of samples.
-
-    Memory holds one batch, an incomplete last block is ignored.
-    """
+    """Block statistics of batches of samples; an incomplete last block is ignored."""
     k = max(2, round((settings or StationarySettings()).block_s / period_s))
     parts = [_blocks_of(np.zeros(0, np.int64), np.zeros((0, 6)), k, 0, period_s)]
     t_left, u_left = np.zeros(0, np.int64), np.zeros((0, 6))
@@ -150,7 +145,7 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
         & ~np.lib.stride_tricks.sliding_window_view(blocks.late, width).any(axis=-1)
     )
     if rests.any():  # a turn-on bias does not jump: an outlier among the resting windows is a steady turn
-        rests &= np.linalg.norm(gyro_mean - median(gyro_mean[rests]), axis=1) <= settings.gyro_agreement_rad_s
+        rests &= np.linalg.norm(gyro_mean - _rate_at_rest(gyro_mean[rests]), axis=1) <= settings.gyro_agreement_rad_s
     resting_blocks = np.zeros(count, bool)
     for shift in range(width):
         resting_blocks[shift : shift + len(rests)] |= rests
@@ -161,7 +156,7 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
 class OnlineRestDetector:
     """Online rest detector: the same rule, causally, from block to block.
 
-    The calmest windows and the median mean at rest come from the samples so far, not from the whole log. A block holds half
+    The calmest windows and the rate at rest come from the samples so far, not from the whole log. A block holds half
     a window; a longer or shorter block changes the lengths in proportion.
     """
 
@@ -215,13 +210,22 @@ class OnlineRestDetector:
         if not (scatter[0] <= max(white, FLOOR_MARGIN * floor) and steady and np.linalg.norm(centre) <= s.gyro_mean_rad_s):
             return False
         self._means.append(centre)
-        return bool(np.linalg.norm(centre - quantile(np.array(self._means), 0.5)) <= s.gyro_agreement_rad_s)
+        return bool(np.linalg.norm(centre - _rate_at_rest(np.array(self._means))) <= s.gyro_agreement_rad_s)
+
+
+def _rate_at_rest(means: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3"]:
+    """Rate that is the bias among those of windows that look like rest; the others are steady turns.
+
+    A bias repeats from window to window. A turn at a constant rate does so, too, but is mostly faster than a bias is large.
+    """
+    some = means[:: -(-len(means) // COMPARED_MEANS)]
+    alike = (np.linalg.norm(some[:, None] - some, axis=2) <= REPEATED_RAD_S).sum(axis=1)
+    often = some[alike >= OFTEN * alike.max()]
+    return np.asarray(often[np.argmin(np.linalg.norm(often, axis=1))])
 
 
 def white_noise(values: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]:
     """White noise of a sample (standard deviation) from calm second differences.
-
-    At rest or in motion.
 
     The variance of second differences is 6 sigma², with little motion in it. The figure is the lower quartile over blocks of
     `NOISE_BLOCK` samples: five sixths of pure white noise. Zero for fewer samples than a block.

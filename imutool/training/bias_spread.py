@@ -80,10 +80,7 @@ class TurnOn(NamedTuple):
 def store_statistics(
     model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
 ) -> TurnOn:
-    """Store the prior, the spread of starts from truth and the noise; return the prior.
-
-    From the training part.
-    """
+    """Store the prior, the spread of starts from truth and the noise; return the prior."""
     scored, left = corrected(model, pool)
     rest, std = rest.clone(), torch.zeros_like(rest)
     shown = np.repeat([sensor in pool.sensors for sensor in SENSORS], 3)
@@ -98,8 +95,9 @@ def store_statistics(
     model.prior_std.copy_(torch.from_numpy(turn_on.std))
     model.truth_std.copy_(_start_spread(scored, left, rest))
     model.walk_std.copy_(_walk(scored, left, rest))
-    at_rest = [np.where(shown, rows, 0.0) for rows in rest_differences(scored.frozen(), _samples(left), biases)]
-    model.rest_std.copy_(torch.from_numpy(shift_at_rest(at_rest, std.cpu().double().numpy())))
+    velocities = [left.v_w[left.log == log].cpu().double().numpy() for log in range(len(left.names))]
+    stops = [np.where(shown, rows, 0.0) for rows in rest_differences(scored.frozen(), _samples(left), biases, velocities)]
+    model.rest_std.copy_(torch.from_numpy(shift_at_rest(stops, std.cpu().double().numpy())))
     return turn_on
 
 

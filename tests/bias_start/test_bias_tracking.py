@@ -28,6 +28,7 @@ from imutool.bias_start.bias_tracking import (
 from imutool.bias_start.initial_bias import smooth_bias
 from imutool.bias_start.prior_width import BiasPrior, LeastWidth, shown_bias, supported_std
 from imutool.inertial import inertial_filter
+from imutool.inertial.inertial_filter import FilterSettings
 from imutool.recording import Imu, seconds
 from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
 
@@ -150,6 +151,19 @@ def test_a_stop_tells_the_bias_at_rest_from_that_in_motion(filtered: Filtered) -
         np.testing.assert_allclose(at_rest.rest_bias(True)[:3], (bias + ground)[:3], rtol=0, atol=3e-4)
         std = np.sqrt(np.diag(at_rest.covariance(False))[:3])
         assert (std > 0.6 * GROUND[:3]).all(), "what differs at rest is not known yet"
+
+
+def test_a_car_that_speeds_up_on_a_straight_road_does_not_stop() -> None:
+    """An engine hides that the rate is not constant: a zero velocity at 15 m/s moved the bias by 20 mrad/s."""
+    t_s, rng = np.arange(0.0, 40.0, 0.01), np.random.default_rng(0)
+    drives = np.clip(t_s - 10.0, 0.0, 1.0)[:, None]
+    engine = np.sin(2.0 * np.pi * (30.0 * t_s[:, None] + 0.1 * np.sin(t_s[:, None]) + [0.0, 0.3, 0.7])) * drives
+    gyro = 1e-3 * rng.normal(size=(4000, 3)) + 0.01 * engine
+    accel = [0.0, 0.0, 9.81] + 0.02 * rng.normal(size=(4000, 3)) + 0.3 * engine + np.outer(drives, [1.0, 0.0, 0.0])
+    car = replace(KNOWN, settings=FilterSettings(speed_m_s=10.0, speed_correlation_s=5.0))
+    blocks = list(filter_blocks(model(), [(t_s, gyro, accel)], car))
+    assert [block.resting for block in blocks] == [block.start_s < 9.9 for block in blocks]
+    assert np.abs(blocks[-1].step.after.bias[:3]).max() < 2e-3
 
 
 def test_rest_at_the_end_is_seen_by_smoothing_and_not_before() -> None:

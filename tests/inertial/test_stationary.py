@@ -95,6 +95,17 @@ def test_a_steady_turn_that_disagrees_with_the_other_stretches_is_not_rest():
     assert found[0][1] == pytest.approx(12.0, abs=EDGE_S)
 
 
+@pytest.mark.parametrize("turn", [np.full(3400, 0.1), 0.03 + 0.06 * np.sin(np.pi * np.arange(3400) / 6800.0)])
+def test_a_camera_that_pans_for_longer_than_it_rests_rests_before(turn: np.ndarray) -> None:
+    """The median of all rates was that of the pan: `debias` then took the turn off, 60° in a minute."""
+    _, gyro, accel = made(23.0)
+    gyro[1200:, 2] += turn
+    t_ns = np.arange(len(gyro)) * 5_000_000
+    (found,) = in_seconds(Imu(t_ns, gyro, accel))
+    assert found == pytest.approx((0.0, 6.0), abs=EDGE_S)
+    assert told(gyro, accel) == [False] * 2 + [True] * 10 + [False] * 34
+
+
 def test_a_steady_turn_too_fast_for_a_bias_is_not_rest():
     t_ns, gyro, accel = made(10.0)
     assert rest_stretches(Imu(t_ns, gyro + np.array([0.0, 0.0, 0.5]), accel)) == []

@@ -9,6 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.switchings_on import Switchings, log
 
+from imutool.bias import static
+from imutool.bias_start.bias_at_rest import rest_differences
 from imutool.bias_start.initial_bias import AT_REST_STD, UNKNOWN_BODY
 from imutool.bias_start.prior_width import USUAL_WALK
 from imutool.mcap_io.write import write
@@ -85,6 +87,20 @@ def test_a_shift_at_rest_has_to_be_shown_by_the_logs_together() -> None:
     assert shift[0] > 5e-3
     np.testing.assert_array_equal(shift[3:], AT_REST_STD[3:])
     np.testing.assert_array_equal(shift_at_rest([np.zeros((0, 6))], std[:1]), AT_REST_STD)
+
+
+def test_a_steady_drive_is_no_stop() -> None:
+    """A straight road looks like rest; the bias in its bends made that of all stops uncertain by 3 mrad/s."""
+    rng, t_s = np.random.default_rng(0), np.arange(0.0, 20.0, 0.01)
+    gyro, accel = 1e-3 * rng.normal(size=(2000, 3)), np.array([0.0, 0.0, 9.81]) + 0.01 * rng.normal(size=(2000, 3))
+    drives = t_s > 8.0
+    gyro[drives, 2] += 0.01
+    v_w = np.outer(15.0 * drives, [1.0, 0.0, 0.0])
+    model, log, rest = static.Model(), [(t_s, gyro, accel)], np.zeros((1, 6))
+    (stops,), (driven,) = rest_differences(model, log, rest, [v_w]), rest_differences(model, log, rest)
+    np.testing.assert_allclose(stops[:, 2], 0.0, atol=2e-4)
+    assert len(stops) == 1
+    assert np.abs(driven[:, 2]).max() > 2e-3
 
 
 def test_logs_of_a_vehicle_widen_the_bound_on_speed() -> None:
