@@ -27,7 +27,7 @@ from imutool.bias import static
 from imutool.bias.model import BiasModel
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.temperature import Scale
-from imutool.bias_start.bias_from_truth import poses_turn_alone
+from imutool.bias_start.bias_from_truth import TRUTH_S, poses_turn_alone
 from imutool.bias_start.correction import apply
 from imutool.bias_start.model_choice import bound_to, estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.errors import DataError, ModelError
@@ -51,6 +51,7 @@ STARTS = ("auto", "smooth", "truth")
 CHANCE = 0.3  # least deviation of a sum of gains over logs, in logarithms of errors, that candidates without a true effect have
 LEAST_ERROR = 1e-6  # ° or m/s
 LONGEST_S = 120.0  # of a log that is scored
+MOST_OF_LOG = 0.5  # that a start from the truth takes: scored on the same seconds, a constant would explain all of them
 DRIFT_S = 5.0
 
 
@@ -262,8 +263,10 @@ def _corrected(log: Recording, model: BiasModel | None, start: str) -> list[Imu]
             static_model, initial = estimate_at_rest(log.imu, log.name)
             return [apply(static_model, initial, log.imu).imu]
         model = model or static.Model()
-        smooth = start == "smooth"
-        initial = smooth_in_memory(model, log.imu, log.name) if smooth else find_initial_bias(start, model, log)
+        if start == "smooth":
+            return [apply(model, smooth_in_memory(model, log.imu, log.name), log.imu).imu]
+        truth_s = min(TRUTH_S, MOST_OF_LOG * float(seconds(log.imu.t_ns[-1:], int(log.imu.t_ns[0]))[0]))
+        initial = find_initial_bias(f"truth:{truth_s}" if start == "truth" else start, model, log)
         return [apply(model, initial, log.imu).imu]
     except (DataError, ModelError):
         return []

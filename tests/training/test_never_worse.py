@@ -16,6 +16,7 @@ from imutool.errors import DataError
 from imutool.evaluation import evaluate
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
+from imutool.sensor.made_up_flight import flight
 from imutool.training.calibration.effect_selection import LINEAR, calibrate
 from imutool.training.left_out import Score, beaten, better_without, keep
 from imutool.training.log_agreement import Contradiction, check_axes, contradicting
@@ -127,6 +128,15 @@ def test_what_only_fast_motion_shows_is_believed_where_nothing_else_is_lost() ->
     assert beaten(shown_by_two, np.zeros(6), surely=2.0)
     assert not beaten(with_losses, np.zeros(6), surely=2.0), "what it gains it may lose on the next log"
     assert not beaten(np.full(3, 0.2), np.array([0.0, 0.0, 0.3]), surely=2.0), "three logs, and no large gain"
+
+
+def test_a_start_from_the_truth_is_scored_on_seconds_that_it_did_not_see(tmp_path: Path) -> None:
+    """Over logs of eight seconds, all of them fitted, a constant of each log was better than any matrix."""
+    logs = [tmp_path / f"{seed}.mcap" for seed in range(8)]
+    for seed, path in enumerate(logs):
+        write(flight(seed, duration_s=8.0, still_s=1.0, rate_hz=100.0), path)
+    card = train(logs, tmp_path / "model.safetensors", method="linear").card
+    assert card["left_out"]["kept"]["gyro"] == "linear"
 
 
 def contradictions(recordings: list[Recording]) -> list[Contradiction]:
