@@ -256,7 +256,8 @@ def started(
 ) -> Iterator[tuple[str, BiasModel, InitialBias]]:
     """Model name, model and initial bias in this recording, for each requested model.
 
-    With `force` models of other rates count, too. With `refused` a model that does not apply to the recording is left out, and `refused` is called with it and the error.
+    With `force` models of other rates count, too. With `refused` a model that does not apply to the recording is left out,
+    and `refused` is called with it and the error.
     """
     check_smooth(init, smooth)
     for given, loaded in [(given, _load(given, recording)) for given in models]:  # a model that is none ends it at once
