@@ -34,7 +34,6 @@ from imutool.bias_start.prior_width import (
     MOST_CHANGE,
     MOST_DEVIATIONS,
     MOST_LEFT,
-    MOST_LEFT_OF_ONE,
     BiasPrior,
     contradicted_start,
     supported_std,
@@ -100,8 +99,8 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     most = np.full(6, MOST_DEVIATIONS) if prior.least is None else MOST_OF_GUESS
     share = share_of_correction(none.innovations, unstarted.innovations)
     confirmed = HALF < share.value - SURE * share.std < MOST_SHARE
-    most_left = MOST_LEFT_OF_ONE if len(model.card.get("sessions", ())) == 1 else MOST_LEFT
-    other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean, most_left, confirmed=confirmed)
+    left = MOST_LEFT.get(len(model.card.get("sessions", ())), MOST_LEFT[0])
+    other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean, left, confirmed=confirmed)
     other_bias, refuted = list(_other_bias(found, prior, most)), list(_refuted(share))
     contradictions = [*other_axes, *other_bias, *_disagreement(found, none), *refuted]
     if harmful or contradictions:
