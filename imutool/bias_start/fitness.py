@@ -58,7 +58,7 @@ MOST_RATE = 2e-3  # relative difference of sample rates; one unit's clock stays 
 HALF, MOST_SHARE = 0.5, 1.5  # of a correction: between them it does more good than harm
 LEAST_SHARE = -2.0  # below, the log lacks so much else that the correction makes it worse by less than half
 LEAST_SHOWN = 0.005  # deviation of a share that a percentage shows
-SURE = 3.0  # standard deviations; of made-up sensors' own shares, the largest lies 3.8 from one
+SURE, OWN = 3.0, 4.0  # standard deviations; of made-up sensors' own shares, the largest lies 3.8 from one
 
 
 @dataclass(frozen=True)
@@ -240,7 +240,7 @@ def _disagreement(found: _Evidence, none: _Evidence) -> Iterator[str]:
 
 def _refuted(share: Share) -> Iterator[str]:
     """Sentence on a correction of which the log shows less than half."""
-    if LEAST_SHARE < share.value < HALF - SURE * share.std:
+    if LEAST_SHARE < share.value < max(HALF - SURE * share.std, min(HALF, 1.0 - OWN * share.std)):
         yield f"{_shown_share(share)}: the correction is another unit's"
 
 
