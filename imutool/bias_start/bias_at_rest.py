@@ -31,9 +31,10 @@ from imutool.bias_start.initial_bias import (
 from imutool.bias_start.prior_width import MOST_DEVIATIONS, BiasPrior, supported_std, widened
 from imutool.errors import DataError
 from imutool.inertial.inertial_filter import LEAST_FORCE_M_S2
-from imutool.inertial.innovations import LEAST_DRIVEN_M_S
+from imutool.inertial.innovations import LEAST_DRIVEN_M_S, MOST_SHAKING
 from imutool.inertial.stationary import Blocks, rest_stretches, resting_blocks, white_noise
 from imutool.recording import GRAVITY_M_S2, Imu, nanoseconds
+from imutool.recording.columns import true_ranges
 
 LOOK_AHEAD_S = 60.0  # in which a log that begins in motion may stop: what the start of a command reads
 REST_BEGINS_WITHIN_S = 5.0  # a later stop would give a bias from the future
@@ -127,14 +128,15 @@ def at_rest(model: BiasModel, imu: Imu) -> InitialBias:
 
 
 def over_all_rest(model: BiasModel, blocks: Blocks) -> InitialBias:
-    """Bias from all rest in a log, also after motion: for a model with a constant bias only.
+    """Bias from all calm rest in a log, also after motion: for a model with a constant bias only.
 
-    It uses only the block statistics of `stationary.block_statistics`, not the samples.
+    It uses only the block statistics of `stationary.block_statistics`, not the samples. What shakes more than the calmest stop
+    may be a steady drive, or a drone whose motors move its bias.
 
     Raises:
         DataError: the log never rests.
     """
-    ranges = resting_blocks(blocks)
+    ranges = _calm(blocks, resting_blocks(blocks))
     if not ranges:
         raise DataError("the log never rests", expected="1.5 s or more without motion")
     stretches = []
@@ -144,6 +146,16 @@ def over_all_rest(model: BiasModel, blocks: Blocks) -> InitialBias:
         ends_ns = int(blocks.first_ns[first]), int(blocks.last_ns[last - 1])
         stretches.append(_RestStretch(mean, squares.sum(axis=0), (last - first) * blocks.k, *ends_ns))
     return _combined(prior(model), stretches, int(blocks.first_ns[0]))
+
+
+def _calm(blocks: Blocks, ranges: Sequence[tuple[int, int]]) -> Sequence[tuple[int, int]]:
+    """Parts of ranges at rest whose seconds shake little more than the calmest; all where none does by both sensors."""
+    block_s, calm = blocks.k * blocks.period_s, np.zeros(len(blocks.late), bool)
+    pieces = [piece for a, b in ranges for piece in np.array_split(np.arange(a, b), max(1, round((b - a) * block_s)))]
+    noise = np.sqrt([blocks.var[piece].mean(axis=0).reshape(2, 3).sum(axis=1) for piece in pieces]).reshape(-1, 2)
+    for piece in itertools.compress(pieces, (noise <= MOST_SHAKING * noise.min(axis=0, initial=np.inf)).all(axis=1)):
+        calm[piece] = True
+    return true_ranges(calm) if calm.any() else ranges
 
 
 def rest_differences(

@@ -34,7 +34,6 @@ from imutool.bias_start.prior_width import (
     MOST_CHANGE,
     MOST_DEVIATIONS,
     MOST_LEFT,
-    MOST_LEFT_OF_ONE,
     BiasPrior,
     contradicted_start,
     supported_std,
@@ -59,7 +58,7 @@ MOST_RATE = 2e-3  # relative difference of sample rates; one unit's clock stays 
 HALF, MOST_SHARE = 0.5, 1.5  # of a correction: between them it does more good than harm
 LEAST_SHARE = -2.0  # below, the log lacks so much else that the correction makes it worse by less than half
 LEAST_SHOWN = 0.005  # deviation of a share that a percentage shows
-SURE = 3.0  # standard deviations; of made-up sensors' own shares, the largest lies 3.8 from one
+SURE, OWN = 3.0, 4.0  # standard deviations; of made-up sensors' own shares, the largest lies 3.8 from one
 
 
 @dataclass(frozen=True)
@@ -100,8 +99,8 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     most = np.full(6, MOST_DEVIATIONS) if prior.least is None else MOST_OF_GUESS
     share = share_of_correction(none.innovations, unstarted.innovations)
     confirmed = HALF < share.value - SURE * share.std < MOST_SHARE
-    most_left = MOST_LEFT_OF_ONE if len(model.card.get("sessions", ())) == 1 else MOST_LEFT
-    other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean, most_left, confirmed=confirmed)
+    left = MOST_LEFT.get(len(model.card.get("sessions", ())), MOST_LEFT[0])
+    other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean, left, confirmed=confirmed)
     other_bias, refuted = list(_other_bias(found, prior, most)), list(_refuted(share))
     contradictions = [*other_axes, *other_bias, *_disagreement(found, none), *refuted]
     if harmful or contradictions:
@@ -241,7 +240,7 @@ def _disagreement(found: _Evidence, none: _Evidence) -> Iterator[str]:
 
 def _refuted(share: Share) -> Iterator[str]:
     """Sentence on a correction of which the log shows less than half."""
-    if LEAST_SHARE < share.value < HALF - SURE * share.std:
+    if LEAST_SHARE < share.value < max(HALF - SURE * share.std, min(HALF, 1.0 - OWN * share.std)):
         yield f"{_shown_share(share)}: the correction is another unit's"
 
 

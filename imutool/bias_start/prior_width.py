@@ -24,8 +24,9 @@ LEAST_SHOWN = 0.2  # precision from the log, of that of the prior, below which t
 SAME_WIDTH = 1e-6  # share of a variance by which a narrower prior differs at least
 SHARES = np.linspace(0.0, 1.0, 25)[:, None]  # of the way from the least width of a prior to the most, in equal ratios
 TURNED = 20.0  # chi-square that turned axes leave at most, and by which they are better
-MOST_LEFT = 0.2  # share of chi-square that turned axes leave; of sensors that were turned up to 0.16, by chance 0.28
-MOST_LEFT_OF_ONE = 0.12  # the same by one session, whose turn-on bias says little of the next: TUM-VI's turned axes up to 0.11
+# Share of chi-square that turned axes leave at most, by known sessions: few say little of the next one. Of sensors that were
+# turned up to 0.16 (TUM-VI's, of one session, 0.11), by chance 0.28.
+MOST_LEFT = {0: 0.2, 1: 0.12, 2: 0.12}
 CONTRADICTED = (np.inf, 10.8, 13.8, 16.3)  # chi-square of as many differences; a true prior exceeds it once in a thousand logs
 
 
@@ -115,9 +116,7 @@ def shown_bias(
     return (bias - mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)
 
 
-def turned_axes(
-    difference: Vector6, std: Vector6, mean: Vector6, most_left: float = MOST_LEFT, *, confirmed: bool = False
-) -> list[str]:
+def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, most_left: float, *, confirmed: bool = False) -> list[str]:
     """Sentence on a log whose bias is clearly that of the training runs in turned axes.
 
     A correction of scales is the same in axes that are turned by half a turn, so the share of it says nothing about these. If

@@ -13,11 +13,12 @@ import imutool
 from imutool.bias import linear, static
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import save
-from imutool.bias_start import Fitness
+from imutool.bias_start import Fitness, fitness
 from imutool.bias_start.bias_at_rest import auto
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import from_numbers, relative_samples
 from imutool.errors import ModelError
+from imutool.inertial.innovations import Share
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2, Imu, Recording
 from imutool.sensor.made_up_flight import flight
@@ -125,6 +126,17 @@ def test_turned_axes_are_caught_though_a_scale_is_the_same_in_them(
     found = judged(wide, replace(recording.imu, gyro=(gyro + shift) @ P, accel=accel @ P))
     assert found.verdict == ("unfit" if half_turns else "fits")
     assert ("+x -y -z: the axes are turned" in " ".join(found.reasons)) is half_turns
+
+
+@pytest.mark.parametrize(
+    ("share", "verdict"), [(Share(0.2, 0.15), "doubtful"), (Share(0.2, 0.25), "fits"), (Share(0.6, 0.05), "fits")]
+)
+def test_a_share_far_from_the_whole_correction_and_below_half_of_it_is_doubtful(
+    monkeypatch: pytest.MonkeyPatch, model: BiasModel, recording: Recording, share: Share, verdict: str
+) -> None:
+    """A third of other units' models that do harm had such a share, and were said to fit."""
+    monkeypatch.setattr(fitness, "share_of_correction", lambda *given: share)
+    assert judged(model, recording.imu).verdict == verdict
 
 
 def test_a_new_turn_on_bias_is_no_turn_of_the_axes_where_the_correction_is_the_sensors(model: BiasModel, scaled: Imu) -> None:

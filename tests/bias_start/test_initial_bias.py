@@ -134,6 +134,16 @@ def test_stops_in_several_attitudes_show_the_accelerometer_from_all_sides() -> N
     np.testing.assert_allclose(all_of_them.rest[:3], GYRO_BIAS, atol=4e-4)
 
 
+def test_a_bias_at_rest_is_that_of_the_calm_stops() -> None:
+    """A car on a straight road looks like rest, but shakes: its bends were a bias of 10 mrad/s."""
+    imu, _ = resting([(0.0, 20.0)], duration_s=20.0)
+    t_s = seconds(imu.t_ns, int(imu.t_ns[0]))[:, None]
+    shaken = (t_s > 6.0) * (np.sin(2.0 * np.pi * 71.0 * t_s) * [0.03, 0.03, 0.03] + [0.0, 0.0, 0.01])
+    start = over_all_rest(static.Model(), blocks_of(replace(imu, gyro=imu.gyro + shaken)))
+    np.testing.assert_allclose(start.rest[:3], GYRO_BIAS, atol=1e-3)
+    assert start.how.startswith("6.")
+
+
 def test_a_models_own_part_is_taken_off_first() -> None:
     """At rest the accelerometer's matrix sees gravity: W f is no turn-on bias."""
     imu, _ = resting()
