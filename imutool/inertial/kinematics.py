@@ -158,7 +158,7 @@ def attitude_by_gyro(
 ) -> Float64[np.ndarray, "n 3 3"] | None:
     """R_wb of samples without noise, level by their mean specific force; heading zero at first.
 
-    A body that stays in a room accelerates by nothing on average. None unless both halves show one gravity, of the Earth's size.
+    A body that stays in a room accelerates by nothing on average. None unless both halves show one gravity of the Earth's size.
     """
     from scipy.spatial.transform import Rotation
 
