@@ -16,12 +16,14 @@ import numpy as np
 
 from imutool.array_types import Float, Float64
 from imutool.errors import DataError, NumericsError
+from imutool.geometry import quaternion
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Times, seconds
 
 DEGREE = 5  # continuous angular acceleration needs 3; 5 also keeps its slope and the jerk continuous
 SMALLEST_NORM = 0.1  # a quaternion spline of smaller norm has knots too far apart
 G_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
 G_W.flags.writeable = False
+LEVEL = 0.01  # of gravity, by which the mean force of a body in a room may differ from it
 GRAVITIES_M_S2 = (GRAVITY_M_S2, 9.80665, 9.8)  # of simulators, which know no other
 
 Vectors = Float64[np.ndarray, "n 3"]
@@ -149,6 +151,26 @@ def fit_trajectory(poses: Poses) -> Trajectory:
     t = seconds(poses.t_ns, int(poses.t_ns[0]))
     position, quaternion = (make_interp_spline(t, y, k=DEGREE) for y in (poses.p_wb, continuous(poses.q_wb_wxyz)))
     return Trajectory(int(poses.t_ns[0]), position, quaternion)
+
+
+def attitude_by_gyro(
+    t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "n 3 3"] | None:
+    """R_wb of samples without noise, level by their mean specific force; heading zero at first.
+
+    A body that stays in a room accelerates by nothing on average. None unless both halves show one gravity of the Earth's size.
+    """
+    from scipy.spatial.transform import Rotation
+
+    turns = quaternion.exp(0.5 * (gyro[1:] + gyro[:-1]) * np.diff(t_s)[:, None])
+    R_0b = quaternion.matrix(quaternion.unit(quaternion.running_product(np.concatenate([[[1.0, 0.0, 0.0, 0.0]], turns]))))
+    force = np.einsum("nij,nj->ni", R_0b, accel)
+    ups, up = [half.mean(axis=0) for half in np.array_split(force, 2)], force.mean(axis=0)
+    size = float(np.linalg.norm(up))
+    if abs(size - GRAVITY_M_S2) > LEVEL * GRAVITY_M_S2 or np.linalg.norm(ups[1] - ups[0]) > LEVEL * GRAVITY_M_S2:
+        return None
+    level, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])
+    return np.asarray(level.as_matrix() @ R_0b)
 
 
 def gravity_error(R_wb: Float64[np.ndarray, "n 3 3"], y: Vectors, least: float) -> Float64[np.ndarray, "3"]:

@@ -27,7 +27,7 @@ CATALOGUE = [  # of physics: what an ideal simulation leaves out, and what any s
     "clock_offset", "clock_skew", "clock_jump", "clock_wander", "gyro_delay", "gyro_dead_band", "low_pass", "saturation",
     "quantization", "gravity", "earth_rotation", "vibration", "mount_resonance", "temperature", "dropped_samples",
     "timestamp_jitter", "reference_error", "reference_smoothing", "driven", "unknown", "gain", "offset", "delay", "dead_band",
-    "drift", "friction",
+    "drift", "friction", "gyro_scale_drift", "gyro_scale_temperature",
 ]  # fmt: skip
 # An uncertainty keeps one digit between 1.95 and 9.5, else two: a number moves by at most this share of it.
 ROUNDED = 0.26

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from support.rates import rates_from_poses
 
 from imutool.errors import DataError, NumericsError
-from imutool.inertial.kinematics import G_W, Trajectory, fit_trajectory, gravity_error
+from imutool.inertial.kinematics import G_W, Trajectory, attitude_by_gyro, fit_trajectory, gravity_error
 from imutool.recording import Poses
 
 START_NS = 1_700_000_000_000_000_123
@@ -189,3 +189,23 @@ def test_a_simulators_gravity_is_a_usual_one_unless_its_samples_show_another(g: 
     y = np.einsum("nji,j->ni", R_wb, [0.0, 0.0, g + G_W[2]]) + [0.1, -0.2, 0.05] + noise * rng.normal(size=(20_000, 3))
     off = gravity_error(R_wb, y, 36.0)
     np.testing.assert_allclose(off, [0.0, 0.0, told + G_W[2]], atol=1e-12 if noise > 0.01 else 1e-4)
+
+
+@pytest.mark.parametrize(("carried", "unit"), [(1e-4, 1.0), (1e-2, 1.0), (1e-4, 1.0 / 9.81)])
+def test_rates_and_forces_give_the_attitude_of_a_body_that_stays_in_a_room(carried: float, unit: float) -> None:
+    """Not of one that is carried off, nor in g."""
+    motion = follow(
+        lambda t: np.outer(carried * t**3, [1.0, 0.0, 0.0]) + np.outer(np.sin(3.0 * t), [0.1, 0.2, 0.1]),
+        lambda t: Rotation.from_rotvec(np.outer(np.sin(2.0 * t), [0.5, 0.3, 0.0])),
+        duration_s=20.0,
+    )
+    t, at = inside(20.0), motion.at(ns(inside(20.0)))
+    R_wb = attitude_by_gyro(t, at.omega_b, unit * at.specific_force())
+    if carried > 1e-3 or unit < 1.0:
+        assert R_wb is None
+    else:
+        assert R_wb is not None
+        true = Rotation.from_quat(at.q_wb_wxyz, scalar_first=True)
+        turned = (Rotation.from_matrix(R_wb) * true.inv()).as_rotvec()
+        np.testing.assert_allclose(turned[:, :2], 0.0, atol=0.02)
+        np.testing.assert_allclose(turned, turned.mean(axis=0, keepdims=True).repeat(len(t), 0), atol=1e-3)

@@ -200,7 +200,7 @@ def test_the_catalogue_of_left_out_physics_is_there() -> None:
         "earth_rotation",
         "vibration",
     }
-    expected |= {"temperature", "vibration_rectification"}
+    expected |= {"temperature", "vibration_rectification", "gyro_scale_drift", "gyro_scale_temperature"}
     assert {one.name for one in catalogue.diagnosed()} == expected
     assert {one.name for one in catalogue.effects()} == expected | {
         "rate_curve",
@@ -634,6 +634,8 @@ def test_biases_follow_the_temperature() -> None:
     warmer = felt.t_s - felt.t_s.mean()
     close(out.gyro - felt.gyro, np.outer(warmer, [1e-3, 0.0, 0.0]))
     close(out.accel - felt.accel, np.outer(warmer, [0.0, 2e-2, 0.0]))
+    scaled = act("gyro_scale_temperature", ideal(only("gyro_scale_temperature"), felt), 1e-3, 0.0, 2e-3)
+    close(scaled.gyro - felt.gyro, np.outer(warmer, [1e-3, 0.0, 2e-3]) * felt.gyro)
     battery = replace(felt, channels={"/battery.temperature": np.zeros(len(felt.t_s)), **felt.channels})
     close(act("temperature", ideal(only("temperature"), battery), 1e-3, 0.0, 0.0, 0.0, 2e-2, 0.0).gyro, out.gyro)
     with pytest.raises(DataError, match=r"no temperature channel; .*close"):

@@ -34,6 +34,7 @@ PLAINER = {  # of one that is no better: another effect, and its parameters, by 
     **{f"gyro_bias_{course}": ("temperature", range(3)) for course in ("drift", "step")},
     **{f"accel_bias_{course}": ("temperature", range(3, 6)) for course in ("drift", "step")},
     **{"gyro_scale_asymmetry": ("gyro_scale", range(3)), "accel_scale_asymmetry": ("accel_scale", range(3))},
+    "gyro_scale_drift": ("gyro_scale_temperature", range(3)),
     "gyro_hysteresis": ("gyro_delay", range(1)),
 }
 SITES_M_S2 = 0.04  # 9.764 to 9.834 m/s² on Earth

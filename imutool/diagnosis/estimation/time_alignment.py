@@ -21,7 +21,7 @@ from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.inertial.correlation import cross_correlation
-from imutool.inertial.kinematics import G_W, fit_trajectory, gravity_error
+from imutool.inertial.kinematics import G_W, attitude_by_gyro, fit_trajectory, gravity_error
 from imutool.inertial.resampling import refined, refinement
 from imutool.inertial.stationary import is_white, may_rest, nothing_but_noise, white_noise
 from imutool.inertial.strapdown import with_velocity
@@ -188,7 +188,9 @@ def _simulated(
     t_s = np.linspace(t_s[0], t_s[-1], len(clean))
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
     t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
-    R_wb = own if (own := _attitude(sim, t_ns + round(shift_s * 1e9))) is not None else _attitude(real, t_ns)
+    known = (_attitude(sim, t_ns + round(shift_s * 1e9)), _attitude(real, t_ns))
+    R_wb = next((R for R in known if R is not None), None)
+    R_wb = attitude_by_gyro(t_s, clean[:, :3], clean[:, 3:]) if R_wb is None else R_wb
     return IdealMotion(t_s, clean[:, :3], clean[:, 3:], alpha, R_wb, _channels(real, t_ns)), noise, None if own_poses else left
 
 

@@ -190,6 +190,8 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "earth_rotation": "{w.it} feels the Earth turn, {w.main.labelled}",
     "vibration": "{w.it} vibrates at {w.main}",
     "mount_resonance": _mount_resonance,
+    "gyro_scale_drift": "its scale grows by {w.main}",
+    "gyro_scale_temperature": "its scale follows the temperature, by {w.main}",
     "temperature": "{w.it} follows the temperature, with {w.main}",
     "dropped_samples": "samples are missing, {w.main.labelled}",
     "timestamp_jitter": "its time stamps jitter, {w.main.labelled}",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.sensor.effect import Effect, Stage, Theta, each_axis
 from imutool.sensor.samples import SensorSamples
@@ -12,8 +13,8 @@ NO_CHANNEL = "Give a log that has it; a diagnosis with `close` takes the channel
 OF_IMU = ("imu", "gyro", "accel")  # in the name of a channel: a battery or a motor has a temperature, too
 
 
-def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
-    """k of the gyro, then of the accelerometer; T0 is the mean of the channel.
+def from_mean(samples: SensorSamples) -> Float64[np.ndarray, " n"]:
+    """Temperature less its mean over the samples.
 
     Of several temperatures that of an IMU counts, by its name, else the first by name.
 
@@ -25,7 +26,12 @@ def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
         expected = "a channel with temperature in its name"
         raise DataError("no temperature channel", where="temperature", expected=expected, fix=NO_CHANNEL)
     T = samples.channels[min(names, key=lambda name: (not any(word in name.lower() for word in OF_IMU), name))]
-    gyro, accel = (np.outer(own, T - T.mean()).T for own in (k[:3], k[3:]))
+    return np.asarray(T - T.mean())
+
+
+def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
+    """k of the gyro, then of the accelerometer; T0 is the mean of the channel."""
+    gyro, accel = (np.outer(own, from_mean(samples)).T for own in (k[:3], k[3:]))
     return samples.with_readings(samples.gyro + gyro, samples.accel + accel)
 
 

@@ -51,6 +51,7 @@ SINGLE = {
     "gyro_scale_asymmetry": [0.05, -0.04, 0.06],
     "gyro_hysteresis": [0.01],
     "gyro_delay": [0.004],
+    "gyro_scale_drift": [1e-3, -5e-4, 2e-3],
 }
 
 
@@ -555,6 +556,15 @@ def fit_cost(found: Selection) -> tuple[float, float]:
 
 
 # ── rivals, and what sets in ──
+
+
+def test_a_scale_of_the_gyro_may_follow_the_temperature() -> None:
+    """It was a scale and steps of the bias."""
+    warm = planted.rich(channels={"/temperature.data": 20.0 + 5.0 * np.sin(0.3 * planted.rich().t_s)})
+    pair = planted.pair(warm, {"gyro_scale_temperature": [4e-3, -2e-3, 3e-3]})
+    found = select_effects([planted.weighed(pair)], (*planted.catalogue(), *catalogue.effects(["gyro_scale_temperature"])))
+    assert names(found) == ["gyro_scale_temperature"]
+    assert sure(found, "gyro_scale_temperature", [4e-3, -2e-3, 3e-3])
 
 
 def test_a_temperature_that_rises_as_the_bias_does_is_named_beside_the_drift() -> None:

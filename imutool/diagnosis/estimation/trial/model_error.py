@@ -24,7 +24,7 @@ SIMPLIFIED = ("mount_resonance", "gyro_hysteresis", "accel_hysteresis")  # a mas
 FOLLOWING = frozenset({*CLOCKS, *FILTERS})
 OF_MOTION = FOLLOWING | {
     *(f"{sensor}_{kind}" for sensor in ("gyro", "accel") for kind in ("scale", "misalignment", "scale_asymmetry", "quadratic")),
-    *("lever_arm", "size_effect", "mount_rotation", "gyro_g_sensitivity"),
+    *("lever_arm", "size_effect", "mount_rotation", "gyro_g_sensitivity", "gyro_scale_drift", "gyro_scale_temperature"),
 }
 
 SLOW = 0.25  # of a cut-off frequency: below, a low-pass takes 0.2 % (second order) to 3 % (first)

@@ -53,7 +53,7 @@ def squares_of_walk(found: Fit, like: Fit, *, of_any_speed: bool = False) -> flo
         for axes, steps, each in _walks(log, found.residuals[k], on_axis, of_any_speed=of_any_speed):
             if log.whiten.walk is not None and log.whiten.walk[axes].any():
                 continue
-            noise = max(1.0, max(one.within for one in each) if of_any_speed else like.reduced_chi_square)
+            noise = max([1.0, *([one.within for one in each] if of_any_speed else [like.reduced_chi_square])])
             likely = sum((one.gain(noise) for one in each), start=np.zeros(len(steps)))
             gained += 2.0 * noise * float(likely[int(np.argmax(likely)) if of_any_speed else _likeliest(likely)])
     return gained
