@@ -20,6 +20,7 @@ from ._table_pose_names import (
     angles_of,
     axes_of,
     bodies_of,
+    from_north,
     matrix_of,
     pose_leaves,
     position_of,
@@ -111,6 +112,9 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
         if named := position_of({split_name(c.removeprefix(group_of(c)))[0]: c for c in position}, NED):
             found["pose_world"] = "ned"
             reasons.append(f"{', '.join(named)} are north, east and down: the poses are turned to east, north, up")
+        elif (yaw := turns.get("roll_pitch_yaw", [""])[-1]).startswith("-"):
+            found["position"] = from_north(position) or position
+            reasons.append(f"{yaw} is taken as 0 along {found['position'][0]}; else state `position` in a map, as y, -x, z")
     return found
 
 

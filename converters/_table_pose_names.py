@@ -102,6 +102,15 @@ def position_of(leaves: dict[str, str], forms: Sequence[tuple[str, Sequence[str]
     return next(filter(None, (axes_of(pattern, leaves, axes) for pattern, axes in forms)), [])
 
 
+def from_north(position: list[str]) -> list[str]:
+    """Columns along north, west and up of positions named east, north and up; else none.
+
+    A heading counts from north.
+    """
+    east = position_of({split_name(leaf_of(column))[0]: column for column in position}, POSITIONS[1:2])
+    return [east[1], f"-{east[0]}", east[2]] if east else []
+
+
 def angles_of(leaves: dict[str, str]) -> list[list[str]]:
     """Columns of each roll, pitch and yaw."""
     yaws = {re.sub(HEADING, "yaw", leaf): column for leaf, column in leaves.items()}
