@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
-from ._table_geodetic import LOCAL
+from ._table_geodetic import EASTING, LOCAL
 from ._table_names import DIGITS, TIME_WORDS, group_of, leaf_of, split_name
 from ._table_text import Columns
 
@@ -28,8 +28,9 @@ POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (r"p(os(ition)?)?_?(?P<axis>[ned])", "ned"),
     (r"(p(os(ition)?)?_?)?ned_?(?P<axis>[xyz])", "xyz"),
     (r"(p(os(ition)?)?_?)?(?P<axis>[xyz])_?ned", "xyz"),
+    *((rf"(?P<axis>{EASTING}|northing|{up})", (EASTING, "northing", up)) for up in ("height", "altitude", "up")),
 )
-NED = POSITIONS[2:]
+NED = POSITIONS[2:-3]
 MATRIX = rf"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r|c){FRAMES}_?(?P<axis>[0-3][0-3]|\d)"  # or Rot[8]
 OWNED = (  # columns of a body's poses: ABBquaternion[0], robot_qw, tool_x
     rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+?)_?"
