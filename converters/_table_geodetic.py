@@ -52,8 +52,8 @@ def add_local(columns: Columns) -> None:
 def in_their_world(columns: Columns, entries: Entries, position: list[str], clock: tuple[str, str]) -> tuple[list[str], str]:
     """Positions in the world of the rotations, or the reason why there are none.
 
-    Gravity shows that world. Those that were made here are north, east and down; a quaternion with z up is in a world of east, north and up. Easting,
-    northing and height are positions where z is up.
+    Gravity shows that world. Those that were made here are north, east and down; a quaternion with z up is in a world of
+    east, north and up. Easting, northing and height are positions where z is up.
     """
     name = split_name(position[0].rpartition("/")[2])[0] if position else ""
     if not name.startswith((LOCAL, EASTING)):

@@ -624,6 +624,15 @@ def test_rows_of_arduinos_serial_monitor_begin_with_the_time_of_their_arrival(tm
     assert (np.diff(imu.t_ns) == 10_000_000).all() == own
 
 
+@pytest.mark.parametrize("blank", [",,,,,,,", "NaN" + ",NaN" * 7])
+def test_a_blank_row_renames_no_further_column(tmp_path, blank):
+    rows = [",".join(map(repr, row)) for row in np.column_stack([T_S, ACCEL_G, COUNTS * 0.07, 20.0 + T_S]).tolist()]
+    (tmp_path / "imu.csv").write_text("\n".join([",".join([*NAMES, "temp"]), *rows[:100], blank, *rows[100:]]) + "\n")
+    log = read(tmp_path / "imu.csv")
+    assert [*log.scalars] == ["/temp"]
+    assert len(log.imus["/imu0"]) == COUNT
+
+
 def test_rows_that_name_no_kind_are_of_one_of_their_own(tmp_path):
     """As the true poses in the JSON lines of Spectacular AI, between rows that name their sensor."""
     rows = []
