@@ -108,7 +108,7 @@ def from_north(position: list[str]) -> list[str]:
 
     A heading counts from north.
     """
-    east = position_of({split_name(leaf_of(column))[0]: column for column in position}, POSITIONS[1:2])
+    east = position_of({split_name(leaf_of(column))[0]: column for column in position}, (POSITIONS[1], *POSITIONS[-3:]))
     return [east[1], f"-{east[0]}", east[2]] if east else []
 
 

@@ -546,7 +546,7 @@ def test_positions_whose_names_say_ned_are_turned_to_a_world_with_z_up(tmp_path,
     np.testing.assert_allclose(Rotation.from_quat(true.q_wb_wxyz, scalar_first=True).as_matrix(), MATRICES, atol=1e-6)
 
 
-@pytest.mark.parametrize("names", ["east,north,up", "x,y,z"])
+@pytest.mark.parametrize("names", ["east,north,up", "easting,northing,altitude", "x,y,z"])
 def test_a_heading_counts_from_the_first_axis_of_the_positions(tmp_path, names):
     """Of positions east, north and up from the second: else they and the rotations would be in two worlds."""
     (tmp_path / "imu.csv").write_text(imu_text())
