@@ -112,8 +112,11 @@ def _unnamed_time(
     """
     firsts = {_table_of(c): c for c in reversed(names) if c not in counters}.values()
     fits = [c for c in others if length in (None, len(columns.values[c])) and rises(columns.values[c])]
+    stated = [c for c in fits if (unit_named(columns.units.get(c, "")) or names[c][1]) in TIME_NS]
+    if len({columns.values[c].tobytes() for c in stated}) == 1:  # one for each signal, as of Delsys
+        stated = stated[:1]
     tries = {
-        "alone rises in a unit of time": [c for c in fits if (unit_named(columns.units.get(c, "")) or names[c][1]) in TIME_NS],
+        "alone rises in a unit of time": stated,
         "rises and is the first column that holds no count": [c for c in fits if c in firsts],
         "alone rises as a time since 1970 does": [c for c in fits if _is_of_this_century(columns.values[c].astype(float))],
     }

@@ -26,6 +26,7 @@ GEODETIC = {
     "longitude": rf"(.*_)?(lon|lng|long|longitude){ANGLE}",
     "height": r"(.*_)?(alt(itude)?|height|hgt|h|elevation)",
 }
+EASTING = "easting"
 LOCAL = "local_"  # begins the names of the columns that are made
 
 
@@ -48,15 +49,25 @@ def add_local(columns: Columns) -> None:
         columns.remarks.notes.append(f"{said}, in m; the angles are taken for {unit}")
 
 
-def fits_gravity(columns: Columns, entries: Entries, position: list[str], clock: tuple[str, str]) -> str:
-    """Why gravity contradicts positions north, east, down that were made here; else empty."""
-    if not split_name(position[0].rpartition("/")[2])[0].startswith(LOCAL):
-        return ""
+def in_their_world(columns: Columns, entries: Entries, position: list[str], clock: tuple[str, str]) -> tuple[list[str], str]:
+    """Positions in the world of the rotations, or the reason why there are none.
+
+    Gravity shows that world. Those that were made here are north, east and down; a quaternion with z up is in a world of
+    east, north and up. Easting, northing and height are positions where z is up.
+    """
+    name = split_name(position[0].rpartition("/")[2])[0] if position else ""
+    if not name.startswith((LOCAL, EASTING)):
+        return position, ""
     share = up_share(columns, entries, rotations(columns, entries), seconds_of(columns, clock), np.eye(3))
-    if share < -UP:
-        return ""
-    what = "has +z up" if share > UP else "does not show which way is up"
-    return f"{', '.join(position)} are no positions of the poses: the world of their rotations {what}, and not +z down"
+    if share > UP and name == EASTING:
+        return position, ""
+    if share > UP and "quaternion_wxyz" in entries:
+        said = "the world of the quaternions has +z up: it counts as east, north, up, and so do the positions"
+        return [position[1], position[0], f"-{position[2]}"], said
+    if share < -UP and name != EASTING:
+        return position, ""
+    what = "has +z up" if share > UP else "has +z down" if share < -UP else "does not show which way is up"
+    return [], f"{', '.join(position)} are no positions of the poses: the world of their rotations {what}"
 
 
 def _unit(columns: Columns, angles: list[str], values: Float64[np.ndarray, "n 3"]) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import chain
 
-from ._table_geodetic import fits_gravity
+from ._table_geodetic import in_their_world
 from ._table_map import IMU_TOPIC, POSE_GROUPS, Entries, column_named
 from ._table_names import ESTIMATED, TIME_WORDS, group_of, leaf_of, name_and_unit, spaced_name, split_name, triples
 from ._table_pose_names import (
@@ -20,6 +20,7 @@ from ._table_pose_names import (
     angles_of,
     axes_of,
     bodies_of,
+    from_north,
     matrix_of,
     pose_leaves,
     position_of,
@@ -100,17 +101,20 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
             poses.append((not named_true, clock, turns, position))
         elif clock[0] != time or named_true or bodies:
             reasons += _why_no_turns(columns, leaves, bodies, _said_apart(columns, clock, (time, unit)))
-    for is_estimate, clock, turns, position in sorted(poses, key=lambda each: (each[0], each[1]))[:1]:
+    for is_estimate, clock, turns, named in sorted(poses, key=lambda each: (each[0], each[1]))[:1]:
         found |= {"truth_time": clock[0], "truth_time_unit": clock[1], **turns}
         found["pose_kind"] = "estimate" if is_estimate else "truth"
-        why = fits_gravity(columns, {**entries, **turns}, position, clock) if position else ""
-        if why or not position:
-            reasons += filter(None, [why])
+        position, why = in_their_world(columns, {**entries, **turns}, named, clock)
+        reasons += filter(None, [why])
+        if not position:
             continue
         found |= {"position": position, "position_unit": _unit_of(columns, position)}
-        if named := position_of({split_name(c.removeprefix(group_of(c)))[0]: c for c in position}, NED):
+        if down := position_of({split_name(leaf_of(c))[0]: c for c in position if c in columns.values}, NED):
             found["pose_world"] = "ned"
-            reasons.append(f"{', '.join(named)} are north, east and down: the poses are turned to east, north, up")
+            reasons.append(f"{', '.join(down)} are north, east and down: the poses are turned to east, north, up")
+        elif (yaw := turns.get("roll_pitch_yaw", [""])[-1]).startswith("-"):
+            found["position"] = from_north(position) or position
+            reasons.append(f"{yaw} is taken as 0 along {found['position'][0]}; else state `position` in a map, as y, -x, z")
     return found
 
 

@@ -77,6 +77,11 @@ def sort_by_clock(columns: Columns) -> None:
         return
     groups = {c: named[c]["before"] or named[c]["behind"] or c for c in clocks}
     apart = Columns()
+    if [*groups.values()] == [*clocks] and len(clocks) == 1:  # of one table, with blank rows
+        for column in [c for c in known if known[c].any()]:
+            _take_rows(columns, column, timed, apart, column)
+        columns.values, columns.units, columns.texts = apart.values, apart.units, apart.texts
+        return
     for column in [c for c in known if c not in clocks and known[c].any()]:
         holders = [clock for clock, rows in clocks.items() if not (known[column] & ~rows).any()]
         smallest = [min(holders, key=lambda clock: clocks[clock].sum())] if holders else [*clocks]

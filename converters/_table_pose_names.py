@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
-from ._table_geodetic import LOCAL
+from ._table_geodetic import EASTING, LOCAL
 from ._table_names import DIGITS, TIME_WORDS, group_of, leaf_of, split_name
 from ._table_text import Columns
 
@@ -28,8 +28,9 @@ POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (r"p(os(ition)?)?_?(?P<axis>[ned])", "ned"),
     (r"(p(os(ition)?)?_?)?ned_?(?P<axis>[xyz])", "xyz"),
     (r"(p(os(ition)?)?_?)?(?P<axis>[xyz])_?ned", "xyz"),
+    *((rf"(?P<axis>{EASTING}|northing|{up})", (EASTING, "northing", up)) for up in ("height", "altitude", "up")),
 )
-NED = POSITIONS[2:]
+NED = POSITIONS[2:-3]
 MATRIX = rf"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r|c){FRAMES}_?(?P<axis>[0-3][0-3]|\d)"  # or Rot[8]
 OWNED = (  # columns of a body's poses: ABBquaternion[0], robot_qw, tool_x
     rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+?)_?"
@@ -100,6 +101,15 @@ def matrix_of(leaves: dict[str, str], forms: Iterable[Sequence[str]] = (*INDICES
 def position_of(leaves: dict[str, str], forms: Sequence[tuple[str, Sequence[str]]] = POSITIONS) -> list[str]:
     """Columns x, y, z of a position, or east, north, up, or north, east, down."""
     return next(filter(None, (axes_of(pattern, leaves, axes) for pattern, axes in forms)), [])
+
+
+def from_north(position: list[str]) -> list[str]:
+    """Columns along north, west and up of positions named east, north and up; else none.
+
+    A heading counts from north.
+    """
+    east = position_of({split_name(leaf_of(column))[0]: column for column in position}, (POSITIONS[1], *POSITIONS[-3:]))
+    return [east[1], f"-{east[0]}", east[2]] if east else []
 
 
 def angles_of(leaves: dict[str, str]) -> list[list[str]]:

@@ -197,6 +197,9 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
     several = (part for line in lines[:first] if line.startswith(COMMENTS) for part in re.split(r", |: (?=.*=)", line))
     stated = filter(None, map(STATED_NUMBER.fullmatch, [*lines[:first], *several]))
     columns.numbers |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in stated}
+    if again := lines[first:].count(lines[first - 1]) if first else 0:  # as of files that were joined
+        lines = [line for row, line in enumerate(lines) if row < first or line != lines[first - 1]]
+        columns.remarks.notes.append(f"{again} lines that repeat the header are left out")
     values, fields, width = _columns_of(lines[first:], lines[:first], delimiter, columns)
     firsts = [row[0].strip().strip('"') for row in fields_of(lines[first : first + FIRSTS], delimiter) if len(row) == width]
     names, units = header_of(lines[:first], delimiter, width, firsts)

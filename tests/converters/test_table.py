@@ -128,6 +128,9 @@ SHAPES = {
         ";".join(f'"{field}"' for field in line.split(";")) + "\n"
         for line in [";".join(GERMAN), *rows_of(STAMPS, VALUES, ";").replace(".", ",").splitlines()]
     ).encode(),
+    "a header that repeats": (
+        ",".join(PLAIN) + "\n" + rows_of(STAMPS[:50], VALUES[:50]) + ",".join(PLAIN) + "\n" + rows_of(STAMPS[50:], VALUES[50:])
+    ).encode(),
     "bars": ("|".join(PLAIN) + "\n" + rows_of(STAMPS, VALUES, "|")).encode(),
     "UTF-16": ("\t".join(PLAIN) + "\n" + rows_of(STAMPS, VALUES, "\t")).encode("utf-16"),
 }

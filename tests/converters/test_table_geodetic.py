@@ -78,3 +78,20 @@ def test_small_angles_without_a_unit_are_no_positions(tmp_path):
     log = recorded(tmp_path / "car", "rad", 1.0, "lat,lon,alt")
     assert not log.poses["/ground_truth/pose"].p_wb.any()
     assert not any("local_north" in note for note in log.remarks.notes)
+
+
+@pytest.mark.parametrize("head", ["latitude [deg],longitude [deg],altitude [m]", "easting,northing,height"])
+def test_positions_on_the_earth_beside_quaternions_in_a_world_with_z_up_are_east_north_up(tmp_path, head):
+    """As those of GNSS beside the orientation of an IMU that ROS has."""
+    rotation = Rotation.from_euler("ZYX", ANGLES[:, ::-1])
+    turns = (rotation[:-1].inv() * rotation[1:]).as_rotvec() * 100.0
+    imu = "time [s],gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s],acc_x [m/s^2],acc_y [m/s^2],acc_z [m/s^2]\n"
+    force = rotation.inv().apply([0.0, 0.0, 9.81])
+    (tmp_path / "imu.csv").write_text(imu + rows(T_S, np.concatenate([turns, turns[-1:]]), force))
+    enu = NED[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    latitude, longitude = 0.9 + NED[:, 0] / 6.37e6, 0.2 + NED[:, 1] / (6.39e6 * np.cos(0.9))
+    place = enu if "easting" in head else np.stack([np.degrees(latitude), np.degrees(longitude), enu[:, 2]], axis=1)
+    (tmp_path / "groundtruth.csv").write_text(f"time [s],{head},qx,qy,qz,qw\n" + rows(T_S, place, rotation.as_quat()))
+    poses = table.read_sequence(table.sequences(tmp_path)[0]).poses["/ground_truth/pose"]
+    np.testing.assert_allclose(poses.p_wb, enu, atol=0.5)  # of the radii above
+    np.testing.assert_allclose(Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_quat(), rotation.as_quat(), atol=1e-6)

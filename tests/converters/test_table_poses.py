@@ -544,3 +544,20 @@ def test_positions_whose_names_say_ned_are_turned_to_a_world_with_z_up(tmp_path,
     true = read(tmp_path).poses["/ground_truth/pose"]
     np.testing.assert_allclose(true.p_wb, P_M, atol=1e-8)
     np.testing.assert_allclose(Rotation.from_quat(true.q_wb_wxyz, scalar_first=True).as_matrix(), MATRICES, atol=1e-6)
+
+
+@pytest.mark.parametrize("names", ["east,north,up", "easting,northing,altitude", "x,y,z"])
+def test_a_heading_counts_from_the_first_axis_of_the_positions(tmp_path, names):
+    """Of positions east, north and up from the second: else they and the rotations would be in two worlds."""
+    (tmp_path / "imu.csv").write_text(imu_text())
+    angles = np.degrees(TURN.as_euler("ZYX"))[:, ::-1]
+    to_north = names != "x,y,z"
+    heading = (90.0 * to_north - angles[:, 2:]) % 360.0
+    (tmp_path / "gt.csv").write_text(f"time [s],{names},roll,pitch,heading\n{rows(T_S, P_M, angles[:, :2], heading)}")
+    log = read(tmp_path)
+    poses = log.poses["/ground_truth/pose"]
+    world = Rotation.from_euler("z", -90.0 * to_north, degrees=True)
+    np.testing.assert_allclose(poses.p_wb, world.apply(P_M), atol=1e-8)
+    found = Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix()
+    np.testing.assert_allclose(found, (world * TURN).as_matrix(), atol=1e-6)
+    assert any("heading is taken as 0 along" in note for note in log.remarks.notes)

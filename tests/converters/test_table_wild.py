@@ -624,6 +624,27 @@ def test_rows_of_arduinos_serial_monitor_begin_with_the_time_of_their_arrival(tm
     assert (np.diff(imu.t_ns) == 10_000_000).all() == own
 
 
+@pytest.mark.parametrize("blank", [",,,,,,,", "NaN" + ",NaN" * 7])
+def test_a_blank_row_renames_no_further_column(tmp_path, blank):
+    rows = [",".join(map(repr, row)) for row in np.column_stack([T_S, ACCEL_G, COUNTS * 0.07, 20.0 + T_S]).tolist()]
+    (tmp_path / "imu.csv").write_text("\n".join([",".join([*NAMES, "temp"]), *rows[:100], blank, *rows[100:]]) + "\n")
+    log = read(tmp_path / "imu.csv")
+    assert [*log.scalars] == ["/temp"]
+    assert len(log.imus["/imu0"]) == COUNT
+
+
+def test_a_time_for_each_signal_that_is_the_same_is_one_time(tmp_path):
+    names = [f"ACC.{a} 1[g]" for a in "XYZ"] + [f"GYRO.{a} 1[deg/s]" for a in "XYZ"]  # of Delsys' Trigno
+    header = ",".join(f'X[s],"Avanti sensor 1: {name}"' for name in names)
+    rows = [[each for value in row for each in (t, value)] for t, row in zip(T_S, np.hstack([ACCEL_G, COUNTS]), strict=True)]
+    (tmp_path / "trial.csv").write_text(
+        "\n".join([header, *(",".join(f"{value:.6f}" for value in row) for row in rows)]) + "\n"
+    )
+    imu = read(tmp_path / "trial.csv").imus["/imu0"]
+    assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 1, 10_000_000))
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(COUNTS), rtol=1e-6)
+
+
 def test_rows_that_name_no_kind_are_of_one_of_their_own(tmp_path):
     """As the true poses in the JSON lines of Spectacular AI, between rows that name their sensor."""
     rows = []
