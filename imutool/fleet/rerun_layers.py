@@ -32,13 +32,17 @@ PENDING = ".partial"
 
 @dataclass(frozen=True)
 class FleetLog:
-    """Log of a fleet: name, place, the JSON of its diagnosis, and facts from fleet.parquet."""
+    """Log of a fleet: name, place, the JSON of its diagnosis, and facts from fleet.parquet.
+
+    Of several fleets the log of the highest `rank` is shown: 2 is debiased, 1 otherwise written, 0 a source.
+    """
 
     name: str
     place: str
     digest: str
     diagnosis: Path | None = None
     facts: Mapping[str, float | str] = field(default_factory=dict)
+    rank: int = 0
 
 
 class Layers(NamedTuple):
@@ -92,7 +96,8 @@ def _log(folder: Path, row: Mapping[str, Any]) -> FleetLog:
     diagnosis = target if row["effects"] is not None and written else None
     place = str(target) if is_log else row["source"]
     name = str(Path(row["target"]).with_suffix("").as_posix())
-    return FleetLog(name, place, f"{row['target_sha256'] or row.get('target_digest')}{row['key']}", diagnosis, _facts(row))
+    digest = f"{row['target_sha256'] or row.get('target_digest')}{row['key']}"
+    return FleetLog(name, place, digest, diagnosis, _facts(row), is_log + bool(is_log and row["models"]))
 
 
 def _facts(row: Mapping[str, Any]) -> dict[str, float | str]:
@@ -106,17 +111,12 @@ def _facts(row: Mapping[str, Any]) -> dict[str, float | str]:
 
 
 def _joined(before: FleetLog | None, log: FleetLog) -> FleetLog:
-    """Log with the facts of two fleets; a log that a fleet wrote is shown rather than its source."""
+    """Log with the facts of two fleets."""
     if before is None:
         return log
-    first, second = (before, log) if log.diagnosis is not None else (log, before)
-    return FleetLog(
-        first.name,
-        first.place,
-        first.digest + second.digest,
-        second.diagnosis or first.diagnosis,
-        {**second.facts, **first.facts},
-    )
+    first, second = (before, log) if before.rank > log.rank else (log, before)
+    diagnosis, facts = second.diagnosis or first.diagnosis, {**second.facts, **first.facts}
+    return FleetLog(first.name, first.place, first.digest + second.digest, diagnosis, facts, first.rank)
 
 
 def build(logs: Sequence[FleetLog], cache: Path, *, workers: int | None = None) -> Iterator[Layers]:

@@ -179,11 +179,14 @@ class WorkerPool:
         return self._alone.popleft() if item is None and self._alone and not self._busy else item
 
     def _start(self) -> _Worker:
-        """Start a process, out of reach of the terminal's Ctrl-C: this process ends it."""
+        """Start a process, out of reach of the terminal's Ctrl-C: this process ends it.
+
+        With -P no module of the current folder, such as a json.py, takes the place of Python's own.
+        """
         ours, theirs = Pipe()
         try:
             process = subprocess.Popen(
-                [sys.executable, "-c", START, str(theirs.fileno()), json.dumps(sys.path)],
+                [sys.executable, "-P", "-c", START, str(theirs.fileno()), json.dumps(sys.path)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 env={**os.environ, **ONE_THREAD},

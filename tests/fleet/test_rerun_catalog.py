@@ -108,6 +108,16 @@ def test_a_target_outside_its_fleet_is_refused(tmp_path: Path) -> None:
         logs_of([tmp_path])
 
 
+def test_the_debiased_log_is_shown_whatever_other_fleets_say_of_it(tmp_path: Path, out: Path) -> None:
+    """A diagnosis without a search, as `fleet info`, took the source, and the debiased layer was lost."""
+    quick = Result(key="k", source=str(out / "raw.mcap"), target="flight_1.json", status="ok", robot="robot_a")
+    (tmp_path / "flight_1.json").write_text("{}")
+    results.write([quick], tmp_path / results.NAME)
+    for folders in ([out, tmp_path], [tmp_path, out]):
+        log = next(log for log in logs_of(folders) if log.name == "flight_1")
+        assert (log.place, log.facts["robot"], log.facts["score"]) == (str(out / "flight_1.mcap"), "robot_a", 0.9)
+
+
 def test_what_cannot_be_shown_is_named(tmp_path: Path, out: Path) -> None:
     (log,) = build([FleetLog("gone", str(tmp_path / "gone.mcap"), "")], tmp_path / "cache")
     assert not log.files

@@ -75,6 +75,12 @@ def test_an_end_that_a_destructor_swallows_comes_again(tmp_path: Path, capfd: py
     assert capfd.readouterr().err == ""
 
 
+def test_a_file_that_is_called_as_a_module_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "json.py").write_text("raise SystemExit")
+    monkeypatch.chdir(tmp_path)
+    assert outcomes(tmp_path, ["well"])["0 well"].error is None
+
+
 def test_workers_that_do_not_start_are_an_error_not_a_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pool_functions.no_worker, "__qualname__", "nowhere")
     monkeypatch.setattr(pool_functions, "nowhere", pool_functions.no_worker, raising=False)
