@@ -128,7 +128,7 @@ def at_rest(model: BiasModel, imu: Imu) -> InitialBias:
 
 
 def over_all_rest(model: BiasModel, blocks: Blocks) -> InitialBias:
-    """Bias from all calm rest in a log, also after motion: for a model with a constant bias only.
+    """Bias from all calm rest in a log: for a model with a constant bias only.
 
     It uses only the block statistics of `stationary.block_statistics`, not the samples. What shakes more than the calmest stop
     may be a steady drive, or a drone whose motors move its bias.

@@ -26,7 +26,7 @@ SHARES = np.linspace(0.0, 1.0, 25)[:, None]  # of the way from the least width o
 TURNED = 20.0  # chi-square that turned axes leave at most, and by which they are better
 # Share of chi-square that turned axes leave at most, by known sessions: few say little of the next one. Of sensors that were
 # turned up to 0.16 (TUM-VI's, of one session, 0.11), by chance 0.28.
-MOST_LEFT = {0: 0.2, 1: 0.12, 2: 0.12}
+MOST_LEFT = {0: 0.2, 1: 0.12, 2: 0.12, 3: 0.12}
 CONTRADICTED = (np.inf, 10.8, 13.8, 16.3)  # chi-square of as many differences; a true prior exceeds it once in a thousand logs
 
 
