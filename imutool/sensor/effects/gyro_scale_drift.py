@@ -1,4 +1,4 @@
-"""Scale error of the gyro that grows with the time from the log's start: omega (1 + s t), per axis."""
+"""Scale error of the gyro that grows with the time t from the start: omega (1 + s t)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scale error of the gyro that follows a temperature channel of the log: omega (1 + s (T - T0)), per axis."""
+"""Scale error of the gyro that follows a temperature of the log: omega (1 + s (T - T0))."""
 
 from __future__ import annotations
 
