@@ -26,8 +26,7 @@ from imutool.fleet.targets import page_name, partial_files, refuse_own, remove_f
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task, failed
 from imutool.report import UNSET
 
-COMPARED = "fleet.json"
-TITLE = b"<title>Fleet "
+COMPARED, TITLE = "fleet.json", b"<title>Fleet "
 MOST_LISTED = 1000  # of the results with a problem, in JSON
 Tell = Callable[[int, int, str], None]
 Wording = Callable[[str], str]
@@ -151,6 +150,7 @@ def run(
 
     with engine() as workers, Journal(target, settings, resume=resume, overwrite=overwrite) as journal:  # workers first
         fleet.remove_partial()
+        remove_files([] if resume else [target / results.NAME])  # it would tell of logs that are replaced now
         try:
             for result in fleet.refused(journal):
                 journal.finish(result)

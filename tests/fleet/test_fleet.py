@@ -142,6 +142,23 @@ def test_a_second_run_skips_all_and_a_changed_log_is_done_again(
     assert len(set(digests(out).values())) == 1
 
 
+def test_a_run_that_begins_anew_and_is_interrupted_leaves_no_table_of_the_one_before(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    run(str(fleet), str(out), INFO, Inline)
+    assert rows(out)
+
+    def interrupted(*_: object) -> Iterator[Result]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Inline, "run", interrupted)
+    for words in ({"resume": True}, {"overwrite": True}):
+        with pytest.raises(KeyboardInterrupt):
+            run(str(fleet), str(out), INFO, Inline, **words)
+        assert (out / "fleet.parquet").exists() == ("resume" in words)
+
+
 def test_somebody_elses_file_stays(fleet: Path, engine: Workers, tmp_path: Path) -> None:
     theirs = tmp_path / "out" / "robot_a" / "log.json"
     theirs.parent.mkdir(parents=True)
