@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from support import planted
 
+from imutool.api.sensors import example_recording
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.to_sensor_files import to_physics_file
@@ -167,6 +168,15 @@ def test_ten_seconds_are_enough_for_what_is_large(tmp_path: Path) -> None:
 def test_a_recording_of_another_rate_than_the_simulation_is_compared(tmp_path: Path) -> None:
     logs = moving(tmp_path, {"lever_arm": ARM}, rate_hz=73.0)
     assert effects(diagnose([logs.real], logs.sim)) == ["lever_arm"]
+
+
+def test_nothing_separates_a_recording_from_a_copy_of_itself(tmp_path: Path) -> None:
+    """Its noise was filtered as that of a simulation, and what the filter took was found."""
+    write(example_recording(3, duration_s=40.0), tmp_path / "copy.mcap")
+    write(example_recording(3, duration_s=40.0), tmp_path / "log.mcap")
+    d = diagnose([tmp_path / "log.mcap"], tmp_path / "copy.mcap")
+    assert not d.findings
+    assert conclusion(d).startswith("Nothing but a constant bias and noise")
 
 
 def test_too_little_shared_time_is_refused_with_how_much_there_is(tmp_path: Path) -> None:

@@ -172,7 +172,8 @@ def _simulated(
     t_sim = without_jitter(t_sim, samples, settings.timestamps)
     period_s = float(np.median(np.diff(t_sim)))
     of_real = white_noise(np.concatenate([real.imu.gyro, real.imu.accel], axis=1)), len(real.imu)
-    ideal = _by_poses(sim, samples, noise, 1.0 / period_s, of_real, settings)
+    copied = np.array_equal(real.imu.gyro, sim.imu.gyro) and np.array_equal(real.imu.accel, sim.imu.accel)
+    ideal = None if copied else _by_poses(sim, samples, noise, 1.0 / period_s, of_real, settings)
     if ideal is not None:
         t_s = seconds(unrounded(sim.truth.t_ns)[:1], start_ns + nanoseconds(shift_s))[0] + ideal.t_s
         ideal = replace(ideal, t_s=t_s, channels=_channels(real, start_ns + np.round(t_s * 1e9).astype(np.int64)))
@@ -183,6 +184,7 @@ def _simulated(
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
     recorded = None if own_poses else recorded_at(real.imu, t_s, start_ns, even[:, :3])  # shares no errors of poses either
     clean, left = denoised(even, 1.0 / period_s, settings.alignment, recorded)
+    clean = even if copied else clean
     noise = np.minimum(noise, left.most)  # a vibration looks like white noise, and a recording shares it
     clean = refined(clean, *of_real)
     t_s = np.linspace(t_s[0], t_s[-1], len(clean))
