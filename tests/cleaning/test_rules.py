@@ -460,6 +460,15 @@ def test_an_axis_that_is_clipped_before_its_calibration_is_saturated_and_a_const
     assert marked.sum() > 0.9 * (np.abs(rates) > 0.9999 * limit).sum()
 
 
+def test_a_sensor_that_rests_on_its_side_is_at_no_end_of_its_range() -> None:
+    """Beside motion to the other side, its noise at rest was said to be flat near -9.3 m/s²."""
+    rng, t = np.random.default_rng(0), np.arange(4000) / 100.0
+    rests, moves = -9.3 + 0.004 * rng.normal(size=len(t)), 1.5 + 7.0 * np.sin(t) + 0.5 * rng.normal(size=len(t))
+    values = np.where(t < 6.0, rests, np.maximum(moves, -8.0))
+    assert not saturation.at_limit(np.where(values < 8.0, values, 2.0 * values - 8.0)).any()
+    assert saturation.at_limit(values)[1:600].all()  # where nothing exceeds it, it may be the end of a range
+
+
 def test_a_long_rest_near_the_largest_value_hides_no_plateau_far_above_it(monkeypatch):
     """As gravity at rest before a flight: too many samples to be held, until a larger value shows what they were."""
     monkeypatch.setattr(saturation, "MOST_NEAR", 5000)

@@ -22,6 +22,7 @@ PILE = 2.0
 LEVELS = 10
 FEW_SAMPLES, FAR, FINE_LEVELS = 3, 0.05, 64  # 64 levels: one step of the sensor is then at most 3 % of its range
 BAND, QUIET = 0.97, 0.75  # of the extreme value, and of the calmest steps: what is less is quieter than the sensor at rest
+WIDER = 1.1  # times a flat end, that the other end of its range has at most: what rests at gravity is flat, too
 LEAST_FLAT, MOSTLY = 30, 0.6  # of noise, 0.39 are so quiet; EuRoC, TUM-VI, FETCH and BROAD have at most 0.52
 BLOCK, FEW_BLOCKS, CALMEST = 50, 3, 0.05  # samples of a block, least blocks away from the extreme, quantile of their steps
 RULE = (
@@ -29,7 +30,8 @@ RULE = (
     f"that value, more than {PILE:g} times as many as either of the next two values, among at least "
     f"{LEVELS} values, and it is not the median; {FEW_SAMPLES} samples are enough among at least {FINE_LEVELS} values, "
     f"where the next value is {100 * FAR:g} % nearer to zero; or where {LEAST_FLAT} samples, and {MOSTLY:.0%} of those within "
-    f"{1 - BAND:.0%} of it, change by less than {QUIET:.0%} of the axis' calmest steps: clipped before a calibration"
+    f"{1 - BAND:.0%} of it, change by less than {QUIET:.0%} of the axis' calmest steps, and no value of the other sign is "
+    f"{WIDER - 1:.0%} larger: clipped before a calibration"
 )
 KEPT = 3  # values at either end: the last one, and the two it is compared with
 MOST_NEAR = 1_000_000  # samples near an extreme value that are held: more, as of gravity at rest, are no plateau
@@ -139,7 +141,8 @@ class Plateau:
         value, step, number, stamp_ns = self._near[side].above(BAND * self._extreme[side])
         size, calm = np.concatenate(self._blocks, axis=1)
         calm = calm[(size < 0.5 * self._extreme[side]) & (calm > 0.0) & np.isfinite(calm)]
-        if len(calm) < FEW_BLOCKS or 2 * len(value) > self._samples:
+        wider = self._extreme[-side] > WIDER * self._extreme[side]
+        if wider or len(calm) < FEW_BLOCKS or 2 * len(value) > self._samples:
             return None
         quiet = step < QUIET * quantile(calm, CALMEST)
         if quiet.sum() < max(LEAST_FLAT, MOSTLY * len(value)):
