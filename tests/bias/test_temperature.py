@@ -270,7 +270,8 @@ def test_a_long_silence_is_told(model: BiasModel) -> None:
 
 
 def test_a_model_without_it_is_the_same_object(build: MakeModel) -> None:
-    plain = build("linear").frozen()
+    (network := build("linear")).rate_hz = RATE_HZ
+    plain = network.frozen()
     assert bound_to(plain, recording(warming())) is plain
     assert FORMS["gyro"].name == "gyro_temperature"
 
