@@ -122,20 +122,20 @@ def goes_back(path: Path) -> bool:
     rows = [re.split(rb"[;,\t ]+", line) for line in lines if line]
     width = max(Counter(map(len, rows)).items(), key=lambda each: each[1], default=(0, 0))[0]
     for column in zip(*(row for row in rows if len(row) == width), strict=True):
-        values = [*map(_number_or_nan, column)]
-        steps = [later - value for value, later in pairwise(value for value in values if value == value)]
-        if len(steps) < len(values) / 2:  # dates, which rise as texts do
+        numbers = [number for field in column if (number := _number(field)) is not None]
+        steps = [later - number for number, later in pairwise(numbers)]
+        if len(numbers) < len(column) / 2:  # dates, which rise as texts do
             steps = [(later > text) - (later < text) for text, later in pairwise(column)]
         if 0 < sum(step < 0 for step in steps) <= MOST_FALLS * sum(step > 0 for step in steps):
             return True
     return False
 
 
-def _number_or_nan(field: bytes) -> float:
+def _number(field: bytes) -> float | None:
     try:
         return float(field)
     except ValueError:
-        return float("nan")
+        return None
 
 
 def is_packed_alone(start: bytes) -> bool:

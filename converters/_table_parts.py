@@ -166,12 +166,11 @@ def _parts(columns: Columns) -> dict[str, TableRows]:
 def _begun(columns: Columns) -> dict[int, Labels]:
     """Number of each row's recording, where all times of a file begin anew in the same rows; none in any other file."""
     times = {name: values for name, values in columns.values.items() if _is_time(leaf_of(name))}
-    starts = {(len(values), *begun_anew(values).tolist()) for values in times.values()}
-    if len(starts) != 1 or len(starts := starts.pop()) == 1:
+    bounds = {(0, *begun_anew(values).tolist(), len(values)) for values in times.values()}
+    if len(bounds) != 1:
         return {}
-    length, *rows = starts
-    lengths = np.diff([0, *rows, length])
-    if lengths.min() < LEAST_ROWS:
+    (_, *rows, length), lengths = next(iter(bounds)), np.diff(next(iter(bounds)))
+    if not rows or lengths.min() < LEAST_ROWS:
         return {}
     said = f"{', '.join(map(repr, times))} begins anew in row {', '.join(str(row + 1) for row in rows[:MOST_SAID])}"
     columns.remarks.notes.append(f"{said}{', ...' if len(rows) > MOST_SAID else ''}: {len(lengths)} recordings")
