@@ -380,6 +380,32 @@ def test_pointers_of_git_lfs_are_named_whatever_reads_such_files(tmp_path: Path)
     assert "gt.csv: pointers of Git LFS" in convert(tmp_path / "walk", tmp_path / "walk.mcap").losses[0]
 
 
+@pytest.mark.parametrize("closed", ["locked", "locked/imu.csv"])
+def test_what_may_not_be_read_is_named_and_stops_no_other_recording(tmp_path: Path, monkeypatch, closed: str) -> None:
+    names = ["time_s", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    for folder in ("locked", "open"):
+        (tmp_path / folder).mkdir()
+        write_csv(tmp_path / folder / "imu.csv", names, [np.arange(50) / 100, *np.full((5, 50), 0.1), np.full(50, 9.8)])
+    access, opened = os.access, Path.open
+
+    def is_closed(path: Path) -> bool:  # chmod does not stop root
+        return path.is_relative_to(tmp_path / closed)
+
+    def open_allowed(path: Path, *args, **options):
+        if is_closed(path):
+            raise PermissionError(13, "Permission denied", str(path))
+        return opened(path, *args, **options)
+
+    monkeypatch.setattr(os, "access", lambda path, mode: not is_closed(Path(path)) and access(path, mode))
+    monkeypatch.setattr(Path, "open", open_allowed)
+    report = convert(tmp_path, tmp_path / "out", workers=1)
+    assert [path.name for path in report.written] == ["open.mcap"]
+    assert report.losses[0].startswith(f"{Path(closed)} may not be read and is left out")
+    if closed != "locked":
+        with pytest.raises(DataError, match=r"imu\.csv may not be read"):
+            convert(tmp_path / "locked", tmp_path / "other")
+
+
 def test_a_folder_without_a_recording_says_of_which_format_most_of_its_known_files_are(tmp_path: Path) -> None:
     for number in (1, 2, 3):
         (tmp_path / f"imu{number}.mat").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:5f5b\nsize 4\n")
