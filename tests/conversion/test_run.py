@@ -399,7 +399,7 @@ def test_what_may_not_be_read_is_named_and_stops_no_other_recording(tmp_path: Pa
     monkeypatch.setattr(os, "access", lambda path, mode: not is_closed(Path(path)) and access(path, mode))
     monkeypatch.setattr(Path, "open", open_allowed)
     report = convert(tmp_path, tmp_path / "out", workers=1)
-    assert [path.name for path in report.written] == ["open.mcap"]
+    assert [path.name for path in report.written] == ["out"]
     assert report.losses[0].startswith(f"{Path(closed)} may not be read and is left out")
     if closed != "locked":
         with pytest.raises(DataError, match=r"imu\.csv may not be read"):
