@@ -338,6 +338,12 @@ def test_converting_needs_no_torch():
         (b'<?xml version="1.0" encoding="UTF-8"?>\n<mvnx version="4">', "Xsens MVN.*sensors measured"),
         (b"\x80\x04\x95\x0f\x00\x00\x00\x00\x00\x00\x00}\x94\x8c\x03acc\x94K\x01s.", "pickle of Python.*numpy.savez"),
         (b"\x02P,\x00", "C3D file.*beside the table"),
+        (
+            b"#group,false\r\n#default,_result\r\n,table,_time,_value,_field\r\n,0,2024-05-01T12:00:00Z,0.1,gx\r\n",
+            r"long.*Pivot",
+        ),
+        (b"Series;Time;Value\ngx;2024-05-01 12:00:00;0.1\n", r"long table.*Pivot"),
+        (b"timestamp,sensor,axis,value\n0.0,gyro,x,0.1\n", r"long table.*Pivot"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:5f5b\nsize 42586\n", "pointer of Git LFS.*git lfs pull"),
         (b"neither one nor the other", "no sequence found; expected a ROS bag"),
     ],
