@@ -837,3 +837,14 @@ def test_rows_below_another_header_are_refused(tmp_path, header, other):
     log = read(path)
     np.testing.assert_array_equal(log.imus["/imu0"].gyro, COUNTS)
     assert any("repeat the header are left out" in note for note in log.remarks.notes)
+
+
+def test_of_a_shimmers_two_accelerometers_the_low_noise_one_is_taken(tmp_path):
+    sensors = "Accel_WR", "Accel_LN", "Gyro"
+    names = ["Shimmer_67_Timestamp_Unix_CAL", *(f"Shimmer_67_{sensor}_{axis}_CAL" for sensor in sensors for axis in "XYZ")]
+    path = write_csv(tmp_path / "imu.csv", names, [T_S * 1000, *(ACCEL_G + 0.1).T, *ACCEL_G.T, *COUNTS.T])
+    header, rows = path.read_text().split("\n", 1)
+    path.write_text("\n".join([header, ",".join(["ms", *["g"] * 6, *["deg/s"] * 3]), rows]))
+    log = read(path)
+    np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL_G * 9.80665)
+    assert any("is the low-noise accelerometer of two" in note for note in log.remarks.notes)
