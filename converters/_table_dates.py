@@ -127,9 +127,9 @@ def dates_of_numbers(values: np.ndarray) -> Int64[np.ndarray, " n"] | None:
 
 
 def ticks_of_windows(values: np.ndarray, epoch: int) -> Int64[np.ndarray, " n"] | None:
-    """Nanoseconds since 1970 of ticks of 100 ns, where they are of this century and of ten samples a second; else None.
+    """Nanoseconds since 1970 of ticks of 100 ns; None for other numbers.
 
-    `epoch` is the tick of 1970.
+    Ticks are of this century, and of at least ten samples a second. `epoch` is the tick of 1970.
     """
     if values.dtype.kind not in "iu" or len(values) < 2 or values.max() > LAST_NS:
         return None
@@ -139,7 +139,7 @@ def ticks_of_windows(values: np.ndarray, epoch: int) -> Int64[np.ndarray, " n"] 
 
 
 def said_epoch(t_ns: int, name: str) -> list[str]:
-    """Note on the date of a time that may count from another day than 1970 began; none on a usual one."""
+    """Note on a date of a time that may count from another day than that of 1970; else none."""
     first_ns = {"2000 (as Polar does)": CENTURY_NS[0], "2001 (as Apple does)": APPLE_NS}
     if "gps" in name.lower() and t_ns + GPS_EPOCH_NS < time.time_ns():
         first_ns = {"1980 (as GPS does)": GPS_EPOCH_NS}

@@ -117,7 +117,7 @@ def refuse_other_header(fields: list[list[str]], path: Path) -> None:
     Raises:
         DataError: a row is another header.
     """
-    for row in range(len(fields[0]) if fields else 0):
+    for row in range(len(fields[0]) if fields and all(fields) else 0):  # no texts are kept of columns of plain numbers
         if any(is_number(texts[row]) for texts in fields):
             continue
         words = [texts[row] for texts in fields]

@@ -68,7 +68,7 @@ def join_gps_weeks(columns: Columns) -> None:
 
 
 def read_clocks_and_days(columns: Columns) -> None:
-    """Make nanoseconds of times as numbers hhmmss, of Windows' ticks, and of days as Excel and MATLAB count them.
+    """Make nanoseconds of numbers hhmmss, of Windows' ticks, and of days of Excel and MATLAB.
 
     Days begin in 1899 and in the year 0. Steps of a sensor are so small in days that they fit no other unit.
     """

@@ -104,7 +104,7 @@ def is_pointer(path: Path) -> bool:
 
 
 def left_out_below(folder: Path) -> list[str]:
-    """Sentences on the pointers of Git LFS in a folder, and on what may not be read, which are left out."""
+    """Sentences on what is left out of a folder: pointers of Git LFS, and what may not be read."""
     found, closed = [path.name for path in pointers_in(folder)], _closed_in(folder)
     pointers = f"{_listed(found)}: pointers of Git LFS in place of the files are left out. {GET_FILES}"
     unread = f"{_listed(closed)} may not be read and is left out. {GIVE_RIGHT}"
