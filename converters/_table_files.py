@@ -92,7 +92,7 @@ def load(path: Path, kind: str) -> Columns:
 
 
 def may_hold_several(path: Path) -> bool:
-    """Whether a file may hold several recordings or sensors: by its names, or a time that goes back.
+    """Whether a file may hold several recordings or sensors, by names or a time that goes back.
 
     JSON and spreadsheets may: theirs are not known before all is read.
     """
