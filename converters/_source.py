@@ -221,8 +221,13 @@ def _folders(folder: Path, depth: int, is_mine: Callable[[Path], bool], is_whole
     if is_found := is_mine(folder):
         yield folder
     if depth > 0 and not (is_found and is_whole(folder)) and not ((folder / ROOT).is_dir() or folder.name == ROOT):
-        for child in sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")):
+        for child in sorted(path for path in folder.iterdir() if is_open(path) and not path.name.startswith(".")):
             yield from _folders(child, depth - 1, is_mine, is_whole)
+
+
+def is_open(path: Path) -> bool:
+    """Whether a path is a folder whose files may be read; `convert` names one that is not."""
+    return path.is_dir() and os.access(path, os.R_OK | os.X_OK)
 
 
 def name(path: Path) -> str:
@@ -270,5 +275,5 @@ def each_path(folder: Path, depth: int = DEPTH) -> Iterator[Path]:
             continue
         if not child.is_dir():
             yield child
-        elif depth > 0:
+        elif depth > 0 and is_open(child):
             yield from each_path(child, depth - 1)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+import time
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -12,6 +15,10 @@ HOUR_NS = 3600 * 10**9
 HALF_DAY_S = 43_200
 LAST_NS = 2**63 - 1  # in the year 2262
 WEEK_NS, GPS_EPOCH_NS = 604_800 * 10**9, 315_964_800 * 10**9  # GPS counts weeks since 1980-01-06
+OLDEST_NS = 631_152_000 * 10**9  # 1990, before which a date is a time since a start
+CENTURY_NS = 946_684_800 * 10**9, 4_102_444_800 * 10**9  # 2000 and 2100
+APPLE_NS = 978_307_200 * 10**9  # 2001
+SLOWEST_TICKS = 10**6
 LEAP_SECONDS = (  # by which GPS is ahead of UTC, since then
     ("2017-01-01", 18),
     ("2015-07-01", 17),
@@ -117,6 +124,40 @@ def dates_of_numbers(values: np.ndarray) -> Int64[np.ndarray, " n"] | None:
         t_ns: Int64[np.ndarray, " n"] = np.array(dates).astype(np.int64)[place] + of_day
         return t_ns
     return None
+
+
+def ticks_of_windows(values: np.ndarray, epoch: int) -> Int64[np.ndarray, " n"] | None:
+    """Nanoseconds since 1970 of ticks of 100 ns; None for other numbers.
+
+    Ticks are of this century, and of at least ten samples a second. `epoch` is the tick of 1970.
+    """
+    if values.dtype.kind not in "iu" or len(values) < 2 or values.max() > LAST_NS:
+        return None
+    ticks: Int64[np.ndarray, " n"] = values.astype(np.int64) - epoch
+    is_fast = 0 < ticks[-1] - ticks[0] <= SLOWEST_TICKS * (len(ticks) - 1)  # nanoseconds of as small a step are of no IMU
+    return ticks * 100 if is_fast and CENTURY_NS[0] // 100 <= ticks.min() <= ticks.max() <= CENTURY_NS[1] // 100 else None
+
+
+def said_epoch(t_ns: int, name: str) -> list[str]:
+    """Note on a date of a time that may count from another day than that of 1970; else none."""
+    first_ns = {"2000 (as Polar does)": CENTURY_NS[0], "2001 (as Apple does)": APPLE_NS}
+    if "gps" in name.lower() and t_ns + GPS_EPOCH_NS < time.time_ns():
+        first_ns = {"1980 (as GPS does)": GPS_EPOCH_NS}
+    elif t_ns >= CENTURY_NS[0]:
+        return []
+    if t_ns < OLDEST_NS:
+        return []
+    date, *others = (str(np.datetime64(t_ns + first, "ns"))[:10] for first in (0, *first_ns.values()))
+    said = " and ".join(f"{other} if it counts since {what}" for other, what in zip(others, first_ns, strict=True))
+    return [f"{name!r} begins on {date} if it counts since 1970, as the log has it; on {said}"]
+
+
+NUMBERED: tuple[tuple[Callable[[np.ndarray], Int64[np.ndarray, " n"] | None], str], ...] = (  # readers, and what they read
+    (dates_of_numbers, "dates and times (yyyymmddhhmmss), which name no zone and count as UTC"),
+    (clock_of_numbers, "hours, minutes and seconds (hhmmss), from the start of the day"),
+    (partial(ticks_of_windows, epoch=116_444_736 * 10**9), "ticks of 100 ns since 1601, as Windows counts them"),
+    (partial(ticks_of_windows, epoch=621_355_968 * 10**9), "ticks of 100 ns since the year 1, as .NET counts them"),
+)
 
 
 def damaged_times(texts: list[str]) -> list[tuple[int, str]]:

@@ -24,7 +24,7 @@ from ._table_mocap import is_mocap, read_mocap
 from ._table_motion import add_gravity
 from ._table_names import group_of, leaf_of, tells_apart
 from ._table_numbers import is_number
-from ._table_packed import read_bytes, text_head
+from ._table_packed import goes_back, read_bytes, text_head
 from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated, state_mip
 from ._table_sensors import read_rows
 from ._table_sheets import load_sheets
@@ -92,14 +92,16 @@ def load(path: Path, kind: str) -> Columns:
 
 
 def may_hold_several(path: Path) -> bool:
-    """Whether the names in a file may be of several recordings or sensors.
+    """Whether a file may hold several recordings or sensors, by names or a time that goes back.
 
     JSON and spreadsheets may: theirs are not known before all is read.
     """
     kind = kind_of(head(path), path)
     names = _names_of(path, kind)
     in_groups = kind in OF_GROUPS and len({*map(group_of, names)} | {""}) > 2
-    return kind in ("json", "sheets") or in_groups or any(tells_apart(leaf_of(name)) for name in names)
+    if kind in ("json", "sheets") or in_groups or any(tells_apart(leaf_of(name)) for name in names):
+        return True
+    return kind == "csv" and goes_back(path)
 
 
 def _names_of(path: Path, kind: str) -> list[str]:

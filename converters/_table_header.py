@@ -5,12 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from itertools import pairwise
+from pathlib import Path
 
+from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
 from ._table_names import TIME_WORDS, UNITS, distinct_names, split_name, unit_named
 from ._table_numbers import fields_of, is_number
 
+MOST_WORDS = 10  # in a refusal
 MOSTLY = 0.8  # share of columns above which a text says nothing of a column
 UNIT_TEXT = re.compile(r"[\[(]?(\W*|[a-zµ°]+([ /*^²\d-]+[a-z\d²-]*)*|-)[\])]?", re.IGNORECASE)
 SENSOR_UNITS = "|".join(UNITS[unit] for unit in ("rad/s", "deg/s", "mdeg/s", "m/s^2", "cm/s^2", "ft/s^2", "mg", "g"))
@@ -104,3 +107,21 @@ def note_unused_header(above: list[str], delimiter: str | None, names: list[str]
         is_header = any(re.fullmatch(TIME_WORDS, name) or unit for name, unit in map(split_name, fields))
         # else it may be a title
         (remarks.losses if is_header else remarks.notes).append(f"{said} ({', '.join(fields)[:200]})")
+
+
+def refuse_other_header(fields: list[list[str]], path: Path) -> None:
+    """Refuse rows below another header: their numbers are of other columns, or in other units.
+
+    Such a header is a row of different words, or of units.
+
+    Raises:
+        DataError: a row is another header.
+    """
+    for row in range(len(fields[0]) if fields and all(fields) else 0):  # no texts are kept of columns of plain numbers
+        if any(is_number(texts[row]) for texts in fields):
+            continue
+        words = [texts[row] for texts in fields]
+        are_names = len({*words}) > len(words) / 2 and all(re.match(r"[^\W\d]", word) for word in words)
+        if are_names or all(map(unit_named, words)):
+            what = f"has another header below {row} rows: {', '.join(words[:MOST_WORDS])}"
+            raise DataError(what, where=path, expected="one", fix="Give the rows below each header a table of their own")

@@ -8,9 +8,12 @@ from __future__ import annotations
 import bz2
 import gzip
 import lzma
+import re
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +31,8 @@ FEW_LINES, LONG_HEAD = 4, 1 << 18  # a header of hundreds of columns and a row o
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 ZSTD = b"\x28\xb5\x2f\xfd"
 ZSTD_STEP = 1 << 10  # packed bytes: a block of four bytes can unpack to 128 KiB
+SAMPLED, LONGEST_LINE = 1000, 1 << 16  # lines from all over a text, which show whether its time begins anew
+MOST_FALLS = 0.3  # of a time, by its rises
 FOREIGN = lzma.LZMAError, zstandard.ZstdError  # errors of damaged bytes that are no OSError
 
 
@@ -101,6 +106,36 @@ def read_bytes(path: Path) -> bytes:
         if total > most:
             raise DataError(f"unpacks to more than {most} bytes", where=path, expected=f"at most {MAX_RATIO} to 1")
     return b"".join(parts)
+
+
+def goes_back(path: Path) -> bool:
+    """Whether lines from all over a plain text hold a column that rises, and falls a few times."""
+    if opener(head(path)) is not None or head(path).startswith(UTF16):
+        return False
+    lines = []
+    with refusing(path), path.open("rb") as file:
+        size = path.stat().st_size
+        for start in range(0, size, max(size // SAMPLED, 1)):
+            file.seek(start)
+            file.readline(LONGEST_LINE)  # the rest of a line
+            lines.append(file.readline(LONGEST_LINE).strip())
+    rows = [re.split(rb"[;,\t ]+", line) for line in lines if line]
+    width = max(Counter(map(len, rows)).items(), key=lambda each: each[1], default=(0, 0))[0]
+    for column in zip(*(row for row in rows if len(row) == width), strict=True):
+        numbers = [number for field in column if (number := _number(field)) is not None]
+        steps = [later - number for number, later in pairwise(numbers)]
+        if len(numbers) < len(column) / 2:  # dates, which rise as texts do
+            steps = [(later > text) - (later < text) for text, later in pairwise(column)]
+        if 0 < sum(step < 0 for step in steps) <= MOST_FALLS * sum(step > 0 for step in steps):
+            return True
+    return False
+
+
+def _number(field: bytes) -> float | None:
+    try:
+        return float(field)
+    except ValueError:
+        return None
 
 
 def is_packed_alone(start: bytes) -> bool:

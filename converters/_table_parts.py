@@ -1,6 +1,7 @@
 """Recordings and sensors of one file, in groups, or by columns that tell them apart.
 
-A table is several recordings where such a column (`trial`) is beside a time that goes back, or beside no time. Sensors
+A table is several recordings where such a column (`trial`) is beside a time that goes back, or beside no time, and where its
+time begins anew without such a column. Sensors
 (`placement`) are IMUs of one recording where they have times in common. Columns of one length are a table.
 """
 
@@ -26,6 +27,7 @@ from ._table_text import Columns, no_numbers
 from ._table_times import LEAST_ROWS, begun_anew, is_counter
 
 NOT_BACK, UP = 0.99, 0.5  # shares of the steps of a time that do not go back, and that go on
+MOST_SAID = 5  # rows
 MOST_BY_TURNS = 60  # recordings whose rows come by turns
 FIX = (
     "Leave `rate_hz` out if a column is the time of each row; else give each recording a table of its own, or name the column"
@@ -143,7 +145,7 @@ def _parts(columns: Columns) -> dict[str, TableRows]:
     """
     recordings, sensors = _labels(columns, is_of_recordings), _labels(columns, is_of_sensors)
     every = {length: recordings.get(length, {}) | sensors.get(length, {}) for length in recordings.keys() | sensors.keys()}
-    if not every:
+    if not every and not (every := (recordings := _begun(columns))):
         return {"": {}}
     longest = max(every)
     parts = _apart(columns, longest, recordings.get(longest, {}))
@@ -159,6 +161,20 @@ def _parts(columns: Columns) -> dict[str, TableRows]:
         for name, rows in found.items():
             rows[length] = others.get(name, np.zeros(0, np.int64))
     return found
+
+
+def _begun(columns: Columns) -> dict[int, Labels]:
+    """Number of each row's recording, where all times of a file begin anew in the same rows; none in any other file."""
+    times = {name: values for name, values in columns.values.items() if _is_time(leaf_of(name))}
+    bounds = {(0, *begun_anew(values).tolist(), len(values)) for values in times.values()}
+    if len(bounds) != 1:
+        return {}
+    (_, *rows, length), lengths = next(iter(bounds)), np.diff(next(iter(bounds)))
+    if not rows or lengths.min() < LEAST_ROWS:
+        return {}
+    said = f"{', '.join(map(repr, times))} begins anew in row {', '.join(str(row + 1) for row in rows[:MOST_SAID])}"
+    columns.remarks.notes.append(f"{said}{', ...' if len(rows) > MOST_SAID else ''}: {len(lengths)} recordings")
+    return {length: {"part": np.repeat(np.arange(1, len(lengths) + 1).astype(str), lengths)}}
 
 
 def _apart(columns: Columns, length: int, labels: Labels, *, always: bool = False) -> dict[str, Rows]:

@@ -100,6 +100,10 @@ def _propose_sensor(
     whole = _with_gravity(found, columns) if sensor == "accel" else found
     if len(whole) < len(found):
         proposal.reasons.append(f"of {len(found)} accelerations {whole[0]['x']}/y/z is the one with gravity")
+    if len(pair := sorted(whole, key=lambda each: _range_of(each) != "ln")) == 2 and [*map(_range_of, pair)] == ["ln", "wr"]:
+        whole = pair[:1]
+        said = f"{pair[0]['x']}/y/z is the low-noise accelerometer of two, which has the smaller range"
+        proposal.reasons.append(f"{said}: a map can name {pair[1]['x']}/y/z in its place")
     if len(whole) != 1:
         proposal.open += [sensor] if whole else [sensor, f"{sensor}_unit"]
         shown = ", ".join(f"{triple['x']}/y/z" for triple in whole[:MOST_SHOWN])
@@ -109,6 +113,12 @@ def _propose_sensor(
         return
     proposal.entries[sensor] = [whole[0][axis] for axis in "xyz"]
     _propose_stated(proposal, sensor, units, names, columns)
+
+
+def _range_of(triple: dict[str, str]) -> str:
+    """Kind of one of the two accelerometers of a Shimmer: `ln` with low noise, `wr` with a wide range; else empty."""
+    match = re.search(r"(?:^|_)(?:(ln|low_?noise)|(wr|wide_?range))(?:_|$)", spaced_name(triple["x"]))
+    return ("ln" if match[1] else "wr") if match else ""
 
 
 def _propose_stated(

@@ -19,7 +19,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
 from ._table_dates import calendar_times, damaged_times, join_dates
-from ._table_header import header_of, note_unused_header, units_in_comments
+from ._table_header import header_of, note_unused_header, refuse_other_header, units_in_comments
 from ._table_names import leaf_of, tells_apart
 from ._table_numbers import (
     COMMA_NUMBER,
@@ -40,6 +40,7 @@ LEAST_NUMBERS = 4  # in a row: a time and a vector
 LEAST_NAMED = 0.1  # share of the rows that have as many fields as the header, if it is theirs
 LOOKED_AT = 200  # first lines, which show whether text is a table
 FIRSTS = 50  # rows that show what a column without a name counts
+AROUND = "\ufeff \t"  # a header that a program has written again
 COMMENTS = "#", "%", "//"
 FIRST_CHARACTERS = 4096  # of a text, which show how its lines begin
 ARRIVAL = re.compile(r"^(\d\d:\d\d:\d\d\.\d{3}) -> ")  # of Arduino's serial monitor
@@ -197,10 +198,13 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
     several = (part for line in lines[:first] if line.startswith(COMMENTS) for part in re.split(r", |: (?=.*=)", line))
     stated = filter(None, map(STATED_NUMBER.fullmatch, [*lines[:first], *several]))
     columns.numbers |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in stated}
-    if again := lines[first:].count(lines[first - 1]) if first else 0:  # as of files that were joined
-        lines = [line for row, line in enumerate(lines) if row < first or line != lines[first - 1]]
+    above = {line.strip(AROUND) for line in lines[:first]}
+    kept = lines[:first] + [line for line in lines[first:] if line.strip(AROUND) not in above]
+    if again := len(lines) - len(kept):  # as of files that were joined
+        lines = kept
         columns.remarks.notes.append(f"{again} lines that repeat the header are left out")
     values, fields, width = _columns_of(lines[first:], lines[:first], delimiter, columns)
+    refuse_other_header(fields, path)
     firsts = [row[0].strip().strip('"') for row in fields_of(lines[first : first + FIRSTS], delimiter) if len(row) == width]
     names, units = header_of(lines[:first], delimiter, width, firsts)
     note_unused_header(lines[:first], delimiter, names, columns.remarks)

@@ -11,7 +11,7 @@ from imutool.array_types import Float64, Int64
 from imutool.errors import ConfigError
 from imutool.recording.message_log import MessageLog
 
-from ._table_dates import WEEK_NS, clock_of_numbers, dates_of_numbers, gps_times
+from ._table_dates import NUMBERED, WEEK_NS, gps_times
 from ._table_names import TIME_WORDS, name_and_unit, split_name, unit_named
 from ._table_text import Columns
 from ._table_units import TIME_NS, USUAL_TIME_NS
@@ -36,10 +36,6 @@ GPS_WEEK = r"(.*_)?(gps_?)?(week|wk|gwk|wn)(_?(no?|num(ber)?))?"
 TIME_OF_WEEK = r"(.*_)?((gps_?)?(tow|sow|time_?of_?week|sec(onds)?_?of_?week)|gps_?(time|sec(onds)?))"
 LEAST_WEEK, MOST_WEEK = 990, 5000  # of 1999, before which receivers counted again from 0, and of 2075
 DAY_NS = 86_400 * NS
-NUMBERED = (
-    (dates_of_numbers, "dates and times (yyyymmddhhmmss), which name no zone and count as UTC"),
-    (clock_of_numbers, "hours, minutes and seconds (hhmmss), from the start of the day"),
-)
 SERIAL_DAYS = {"Excel": 25_569, "MATLAB": 719_529}  # days of their calendars at the start of 1970
 FIRST_DAY, LAST_DAY = 10_957, 47_482  # of 2000 and of 2100, since 1970
 WORD_SIZES = 2**8, 2**16, 2**32  # at which a counter begins again
@@ -72,13 +68,13 @@ def join_gps_weeks(columns: Columns) -> None:
 
 
 def read_clocks_and_days(columns: Columns) -> None:
-    """Make nanoseconds of times as numbers hhmmss, and of days as Excel and MATLAB count them.
+    """Make nanoseconds of numbers hhmmss, of Windows' ticks, and of days of Excel and MATLAB.
 
     Days begin in 1899 and in the year 0. Steps of a sensor are so small in days that they fit no other unit.
     """
     for column, values in columns.values.items():
         name, unit = name_and_unit(column, columns.units.get(column, ""))
-        is_named = re.search(r"time|date|day|stamp|utc", name) or re.fullmatch(TIME_WORDS, name)
+        is_named = re.search(r"time|date|day|stamp|utc|tick", name) or re.fullmatch(TIME_WORDS, name)
         found = ((t_ns, said) for read, said in NUMBERED if is_named and (t_ns := read(values)) is not None)
         if numbered := next(found, None):
             columns.values[column], columns.units[column] = numbered[0], "ns"

@@ -23,6 +23,7 @@ from imutool.recording.sample_order import in_order, lost_to_set_back
 
 from . import Sequence, _unpacking
 from ._source import head, name
+from ._table_dates import said_epoch
 from ._table_files import kind_of, load
 from ._table_folder import load_split, sequences_below
 from ._table_groups import MOST_CONSTANTS, group_entries, imus_apart, pose_clock, shared_group, time_beside, turned
@@ -211,7 +212,7 @@ def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
         if len(t_ns) != len(values):
             raise ConfigError(f"the {label} has {len(values)} rows and its time {len(t_ns)}", where=place, expected="as many")
     imu, _, notes = joined(gyro_ns, gyro, accel_ns, accel, table.topic)
-    columns.remarks.notes.extend(notes)
+    columns.remarks.notes.extend([*notes, *said_epoch(int(imu.t_ns[0]), table.time)])
     columns.remarks.losses.extend(lost_to_set_back(gyro_ns, table.topic))
     columns.remarks.doubt([f"{table.topic}: {each}" for each in unit_doubts(imu, table.gyro_unit, table.accel_unit)])
     return imu

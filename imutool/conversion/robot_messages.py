@@ -134,7 +134,7 @@ def _px4(topic: MessageTopic, kind: str, schema_name: str, ending: str) -> Px4 |
 
 def pose_kind(topic: str) -> str:
     """Kind of the poses of PX4 or of a path: by the topic's name, else an estimate."""
-    kind = named_kind(re.sub(r"/fmu/out/vehicle_odometry$", "", topic), "")  # which is the EKF's
+    kind = named_kind(re.sub(r"/fmu/out/vehicle_odometry(_v\d+)?$", "", topic), "")  # which is the EKF's
     return "estimate" if kind == "unknown" else kind
 
 

@@ -17,7 +17,7 @@ from typing import Any
 from imutool import registry
 from imutool.conversion import Failure
 from imutool.conversion.corrections import CONVENTIONS, STAMPS
-from imutool.conversion.unread_formats import blamed, is_pointer, nothing_found, pointers_below, pointers_in
+from imutool.conversion.unread_formats import blamed, is_pointer, left_out_below, nothing_found, pointers_in
 from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, SUFFIX, ConvertReport, Job, Progress, check_targets, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
@@ -98,7 +98,7 @@ def convert(
         if not found.names():
             raise nothing_found(packed.content, packed=packed.root is not None)
         report = _convert_found(found, source, out, sequences, ways, workers, progress)
-        report.losses.extend(pointers_below(packed.content))
+        report.losses.extend(left_out_below(packed.content))
     if packed.root is None:
         return report
     names = [name for name in packed.places if name not in found.empty] if source.is_dir() else [source.name]

@@ -17,6 +17,7 @@ MOST_NAMED = 3  # pointers
 RECORDINGS = (  # endings of what may be a recording, or a part of one
     r"\.(bag|db3|mcap|ulg|bin|log|csv|tsv|txt|dat|tum|jsonl?|mat|np[yz]|parquet|feather|arrow|h5|hdf5|xlsx?|zip|tar|gz|xz|bz2|zst)$"
 )
+GIVE_RIGHT = "Give yourself the right to read it, and convert again"
 POINTER, GET_FILES = rb"version https://git-lfs\.github\.com/spec/", "Get the files with git lfs pull, and convert again"
 FORMATS = {  # what a file that begins like this is, and what to do
     rb"H Product:Blackbox": (
@@ -63,6 +64,10 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "it is a pickle of Python, which can run any program when it is read",
         "Load it where you trust its source, save the arrays with numpy.savez, and convert that",
     ),
+    rb"(#[^\n]*\n)*([^\n]*[,;\t])?['\"]?(?i:_?value)['\"]?\s*[,;\t\n]": (  # as InfluxDB and Grafana export
+        "it is a long table, with a row for each number",
+        "Pivot it to a row for each time and a column for each axis, as pivot() of Flux and pivot_table() of pandas do",
+    ),
     POINTER: ("it is a pointer of Git LFS in place of the file", GET_FILES),
     rb"PK\x03\x04|.{257}ustar": (
         "it is an archive whose name does not end in .zip, .tar, .tar.gz or .tgz",
@@ -98,12 +103,25 @@ def is_pointer(path: Path) -> bool:
     return path.is_file() and path.stat().st_size <= ENOUGH and re.match(POINTER, first_bytes(path, ENOUGH)) is not None
 
 
-def pointers_below(folder: Path) -> list[str]:
-    """Sentence on the pointers of Git LFS in a folder, which are left out; none without any."""
-    found = [path.name for path in pointers_in(folder)]
-    more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
-    said = f"{', '.join(found[:MOST_NAMED])}{more}: pointers of Git LFS in place of the files are left out"
-    return [f"{said}. {GET_FILES}"] if found else []
+def left_out_below(folder: Path) -> list[str]:
+    """Sentences on what is left out of a folder: pointers of Git LFS, and what may not be read."""
+    found, closed = [path.name for path in pointers_in(folder)], _closed_in(folder)
+    pointers = f"{_listed(found)}: pointers of Git LFS in place of the files are left out. {GET_FILES}"
+    unread = f"{_listed(closed)} may not be read and is left out. {GIVE_RIGHT}"
+    return [said for said, names in ((pointers, found), (unread, closed)) if names]
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
+
+
+def _closed_in(folder: Path) -> list[str]:
+    """Folders and recordings below a folder that the user may not read."""
+    found = []
+    for inside, folders, files in os.walk(folder):
+        paths = [Path(inside, name) for name in (*folders, *(file for file in files if re.search(RECORDINGS, file.lower())))]
+        found += [str(p.relative_to(folder)) for p in paths if not os.access(p, os.R_OK | (os.X_OK if p.is_dir() else 0))]
+    return sorted(found)
 
 
 def blamed(error: ImutoolError, pointers: Sequence[Path]) -> ImutoolError:
@@ -148,6 +166,8 @@ def describe_folder(folder: Path) -> tuple[str, str]:
         (what, fix), alike = max(said.items(), key=lambda each: len(each[1]))
         others = f" and {len(alike) - 1} other{'s' * (len(alike) > 2)}" if len(alike) > 1 else ""
         return f"of {alike[0]}{others}, {what}", fix
+    if closed := _closed_in(folder):
+        return f"{_listed(closed)} may not be read", GIVE_RIGHT
     if names:
         return (
             "",

@@ -104,15 +104,12 @@ def converted(tmp_path: Path, topics: dict[str, list[tuple[int, Any]]]) -> tuple
     return tmp_path / "out.mcap", convert(source, tmp_path / "out.mcap")
 
 
-@pytest.mark.parametrize("make", [combined, integrated])
-def test_px4s_imu_and_odometry_arrive_in_flu_and_enu(tmp_path, make):
-    kind = make(0).__msgtype__
-    topics = {
-        "/fmu/out/imu": [(n, make(n)) for n in range(COUNT)],
-        "/fmu/out/vehicle_odometry": [(n, odometry(n)) for n in range(COUNT)],
-    }
+@pytest.mark.parametrize(("make", "version"), [(combined, ""), (integrated, "_v1")])  # of a message, since PX4 1.16
+def test_px4s_imu_and_odometry_arrive_in_flu_and_enu(tmp_path, make, version):
+    kind, poses = make(0).__msgtype__, f"/fmu/out/vehicle_odometry{version}"
+    topics = {"/fmu/out/imu": [(n, make(n)) for n in range(COUNT)], poses: [(n, odometry(n)) for n in range(COUNT)]}
     out, report = converted(tmp_path, topics)
-    recording = read(out, truth="/fmu/out/vehicle_odometry/pose")
+    recording = read(out, truth=f"{poses}/pose")
     np.testing.assert_allclose(recording.imu.gyro, GYRO * (np.arange(COUNT)[:, None] + 1), rtol=1e-6)
     np.testing.assert_allclose(recording.imu.accel, np.tile(ACCEL, (COUNT, 1)), rtol=1e-6)
     assert recording.imu.t_ns.tolist() == [10_000_000 * (n + 500) for n in range(COUNT)]
@@ -120,7 +117,7 @@ def test_px4s_imu_and_odometry_arrive_in_flu_and_enu(tmp_path, make):
     turns = Rotation.from_quat(recording.truth.q_wb_wxyz.copy(), scalar_first=True)
     assert (turns * R_ENU.inv()).magnitude().max() < 1e-6
     with Log(out) as log:
-        assert log.topics["/fmu/out/vehicle_odometry/pose"].pose_kind == "estimate"
+        assert log.topics[f"{poses}/pose"].pose_kind == "estimate"
         assert log.topics["/fmu/out/imu"].schema_name == kind  # PX4's own topic stays
     assert any("in FLU and ENU" in note for note in report.notes)
 

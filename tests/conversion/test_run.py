@@ -338,6 +338,12 @@ def test_converting_needs_no_torch():
         (b'<?xml version="1.0" encoding="UTF-8"?>\n<mvnx version="4">', "Xsens MVN.*sensors measured"),
         (b"\x80\x04\x95\x0f\x00\x00\x00\x00\x00\x00\x00}\x94\x8c\x03acc\x94K\x01s.", "pickle of Python.*numpy.savez"),
         (b"\x02P,\x00", "C3D file.*beside the table"),
+        (
+            b"#group,false\r\n#default,_result\r\n,table,_time,_value,_field\r\n,0,2024-05-01T12:00:00Z,0.1,gx\r\n",
+            r"long.*Pivot",
+        ),
+        (b"Series;Time;Value\ngx;2024-05-01 12:00:00;0.1\n", r"long table.*Pivot"),
+        (b"timestamp,sensor,axis,value\n0.0,gyro,x,0.1\n", r"long table.*Pivot"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:5f5b\nsize 42586\n", "pointer of Git LFS.*git lfs pull"),
         (b"neither one nor the other", "no sequence found; expected a ROS bag"),
     ],
@@ -378,6 +384,33 @@ def test_pointers_of_git_lfs_are_named_whatever_reads_such_files(tmp_path: Path)
     names = ["time_s", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
     write_csv(tmp_path / "walk/imu.csv", names, [np.arange(50) / 100, *np.full((5, 50), 0.1), np.full(50, 9.8)])
     assert "gt.csv: pointers of Git LFS" in convert(tmp_path / "walk", tmp_path / "walk.mcap").losses[0]
+
+
+@pytest.mark.parametrize("closed", ["locked", "locked/imu.csv"])
+def test_what_may_not_be_read_is_named_and_stops_no_other_recording(tmp_path: Path, monkeypatch, closed: str) -> None:
+    names = ["time_s", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    for folder in ("locked", "open"):
+        (tmp_path / folder).mkdir()
+        write_csv(tmp_path / folder / "imu.csv", names, [np.arange(50) / 100, *np.full((5, 50), 0.1), np.full(50, 9.8)])
+    access, opened = os.access, Path.open
+
+    def is_closed(path: Path) -> bool:  # chmod does not stop root
+        return path.is_relative_to(tmp_path / closed)
+
+    def open_allowed(path: Path, *args, **options):
+        if is_closed(path):
+            raise PermissionError(13, "Permission denied", str(path))
+        return opened(path, *args, **options)
+
+    monkeypatch.setattr(os, "access", lambda path, mode: not is_closed(Path(path)) and access(path, mode))
+    monkeypatch.setattr(Path, "open", open_allowed)
+    report = convert(tmp_path, tmp_path / "out", workers=1)
+    assert [path.name for path in report.written] == ["out"]
+    assert report.losses[0].startswith(str(Path(closed)))
+    assert " may not be read and is left out. Give yourself the right" in report.losses[0]
+    if closed != "locked":
+        with pytest.raises(DataError, match=r"imu\.csv may not be read"):
+            convert(tmp_path / "locked", tmp_path / "other")
 
 
 def test_a_folder_without_a_recording_says_of_which_format_most_of_its_known_files_are(tmp_path: Path) -> None:

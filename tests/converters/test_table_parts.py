@@ -20,6 +20,7 @@ RNG = np.random.default_rng(5)
 VALUES = np.round(RNG.normal([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], 0.1, (PARTS * COUNT, 6)), 5)
 PART = np.repeat(np.arange(1, PARTS + 1), COUNT)
 T_S = np.tile(np.arange(COUNT) / RATE_HZ, PARTS)
+PARTED = [f"all_part_{part}" for part in range(1, PARTS + 1)]
 LETTERS = np.array(["A", "B", "C"])[PART - 1]
 TURNS = np.arange(PARTS * COUNT).reshape(PARTS, COUNT).T.reshape(-1)  # rows of each part by turns
 
@@ -94,7 +95,8 @@ def test_trials_of_one_time_are_one_recording(tmp_path):
 def test_a_counter_tells_no_recordings_apart(tmp_path):
     counts = np.arange(PARTS * COUNT)
     for labels in (counts // 10, counts // 5 % 64):
-        assert len(table.sequences(csv(tmp_path / "all.csv", {"series": labels, **TIMED}))) == 1
+        found = table.sequences(csv(tmp_path / "all.csv", {"series": labels, **TIMED}))
+        assert [each.name for each in found] == PARTED  # by the time
 
 
 @pytest.mark.parametrize("rows", [None, TURNS])
@@ -136,14 +138,30 @@ def test_sensors_that_share_no_time_are_logs_of_their_own(tmp_path, beside):
     assert_parts(found, ["all_sensor_1", "all_sensor_2", "all_sensor_3"])
 
 
-@pytest.mark.parametrize(("name", "values"), [("time_s", T_S), ("sample", np.tile(np.arange(COUNT), PARTS))])
-def test_rows_are_not_counted_across_a_time_or_counter_that_begins_anew(tmp_path, name, values):
-    path = csv(tmp_path / "all.csv", {name: values})
-    with pytest.raises(ConfigError, match=rf"'{name}' begins anew in row 201, as of 3 recordings"):
+def test_rows_are_not_counted_across_a_counter_that_begins_anew(tmp_path):
+    path = csv(tmp_path / "all.csv", {"sample": np.tile(np.arange(COUNT), PARTS)})
+    with pytest.raises(ConfigError, match="'sample' begins anew in row 201, as of 3 recordings"):
         logs(path, {"rate_hz": RATE_HZ})
-    if name == "sample":
-        with pytest.raises(ConfigError, match="begins anew in row 201"):
-            logs(path, {"rate_hz": RATE_HZ, "counter": name})
+    with pytest.raises(ConfigError, match="begins anew in row 201"):
+        logs(path, {"rate_hz": RATE_HZ, "counter": "sample"})
+
+
+@pytest.mark.parametrize("mapping", [{}, {"rate_hz": RATE_HZ}])
+@pytest.mark.parametrize("header_again", [False, True])
+def test_recordings_are_apart_where_the_time_begins_anew(tmp_path, header_again, mapping):
+    path = csv(tmp_path / "all.csv", TIMED)
+    if header_again:
+        header, *rows = path.read_text().splitlines()
+        path.write_text("\n".join(line for n, row in enumerate(rows) for line in ([header] if n % COUNT == 0 else []) + [row]))
+    assert_parts(logs(path, mapping), PARTED)
+    assert "'time_s' begins anew in row 201, 401: 3 recordings" in table.read_sequence(table.sequences(path)[0]).remarks.notes
+
+
+@pytest.mark.parametrize("start", [3, PARTS * COUNT - 3])
+def test_a_time_that_is_set_back_beside_a_few_samples_begins_no_recording(tmp_path, start):
+    t_s = np.arange(PARTS * COUNT) / RATE_HZ
+    t_s[start:] -= t_s[start]
+    assert len(table.sequences(csv(tmp_path / "all.csv", {"time_s": t_s}))) == 1
 
 
 @pytest.mark.parametrize("size", [64, 100])

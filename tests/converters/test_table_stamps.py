@@ -107,3 +107,30 @@ def test_dates_without_marks_are_times_in_utc_also_across_midnight(tmp_path: Pat
     (tmp_path / "imu.csv").write_text("\n".join(["timestamp,gx,gy,gz,ax,ay,az", *rows]) + "\n")
     log = table.read_sequence(table.sequences(tmp_path / "imu.csv")[0], mapping={"gyro_unit": "rad/s"})
     assert log.imus["/imu0"].t_ns.tolist() == [(start_ms + 10 * n) * 10**6 for n in range(COUNT)]
+
+
+@pytest.mark.parametrize("epoch", [116_444_736 * 10**9, 621_355_968 * 10**9])
+def test_ticks_of_windows_are_dates(tmp_path: Path, epoch: int) -> None:
+    t_ns = 1_714_564_800 * 10**9 + T_NS
+    rows = lines(t_ns // 100 + epoch, GYRO, ACCEL)
+    (tmp_path / "log.csv").write_text("\n".join(["timestamp,gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path)[0], mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_array_equal(log.imus["/imu0"].t_ns, t_ns // 100 * 100)
+
+
+@pytest.mark.parametrize(
+    ("name", "first_s", "kept", "said"),
+    [
+        ("timestamp", 767_880_000, "1994-05-02", "2024-05-01 if it counts since 2000"),
+        ("gps_time", 1_398_600_018, "2014-04-27", "2024-05-01 if it counts since 1980"),
+        ("timestamp", 1_714_564_800, "", ""),
+        ("gps_time", 1_714_564_800, "", ""),
+        ("timestamp", 0, "", ""),
+    ],
+)
+def test_a_date_that_may_count_from_another_day_than_1970_began_is_noted(tmp_path, name, first_s, kept, said) -> None:
+    rows = lines(first_s * 10**9 + T_NS, GYRO, ACCEL)
+    (tmp_path / "log.csv").write_text("\n".join([f"{name} [ns],gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path)[0], mapping={"gyro_unit": "rad/s"})
+    notes = [note for note in log.remarks.notes if "if it counts since" in note]
+    assert [f"begins on {kept} if" in note and f"; on {said}" in note for note in notes] == [True] * bool(said)

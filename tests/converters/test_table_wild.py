@@ -16,7 +16,7 @@ from imutool.converters import table
 from imutool.converters._table_headerless import as_table
 from imutool.converters._table_names import split_name
 from imutool.converters._table_units import raw_counts
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
 from imutool.recording.gyro_steps import unit_by_steps
 
 COUNT = 300
@@ -813,3 +813,38 @@ def test_a_counter_of_32_bits_goes_on_where_it_begins_again(tmp_path):
     assert log.imus["/imu0"].t_ns.tolist() == (1000 * t_us).tolist()
     assert log.remarks.losses == []
     assert log.remarks.notes.count("'time_us' begins again at 2^32 (1 times): its times go on there") == 1
+
+
+NAMED_AND_IN_UNITS = "time,gx,gy,gz,ax,ay,az\ns,rad/s,rad/s,rad/s,g,g,g"
+
+
+@pytest.mark.parametrize(
+    ("header", "other"),
+    [
+        (HEADER := "time [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [g],ay [g],az [g]", HEADER.replace("rad", "deg")),
+        (HEADER, "time [s],gz [rad/s],gy [rad/s],gx [rad/s],az [g],ay [g],ax [g]"),
+        (NAMED_AND_IN_UNITS, NAMED_AND_IN_UNITS.replace("rad", "deg")),
+    ],
+)
+def test_rows_below_another_header_are_refused(tmp_path, header, other):
+    """They would be of other columns, or in other units."""
+    rows = [",".join(map(str, row)) for row in np.column_stack([T_S, COUNTS, ACCEL_G])]
+    half, path = COUNT // 2, tmp_path / "imu.csv"
+    path.write_text("\n".join([header, *rows[:half], other, *rows[half:]]) + "\n")
+    with pytest.raises(DataError, match=f"has another header below {half} rows: "):
+        read(path)
+    path.write_text("\n".join([header, *rows[:half], f"\ufeff{header} ", *rows[half:]]) + "\n")  # the same one
+    log = read(path)
+    np.testing.assert_array_equal(log.imus["/imu0"].gyro, COUNTS)
+    assert any("repeat the header are left out" in note for note in log.remarks.notes)
+
+
+def test_of_a_shimmers_two_accelerometers_the_low_noise_one_is_taken(tmp_path):
+    sensors = "Accel_WR", "Accel_LN", "Gyro"
+    names = ["Shimmer_67_Timestamp_Unix_CAL", *(f"Shimmer_67_{sensor}_{axis}_CAL" for sensor in sensors for axis in "XYZ")]
+    path = write_csv(tmp_path / "imu.csv", names, [T_S * 1000, *(ACCEL_G + 0.1).T, *ACCEL_G.T, *COUNTS.T])
+    header, rows = path.read_text().split("\n", 1)
+    path.write_text("\n".join([header, ",".join(["ms", *["g"] * 6, *["deg/s"] * 3]), rows]))
+    log = read(path)
+    np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL_G * 9.80665)
+    assert any("is the low-noise accelerometer of two" in note for note in log.remarks.notes)
