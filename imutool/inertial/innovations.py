@@ -10,11 +10,11 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.inertial.inertial_filter import Step
+from imutool.inertial.stationary import MOST_SHAKING
 
 STUDENT = 7.0  # degrees of freedom of the likelihood, so that one jolt does not decide
 SURPRISING = 7.81  # chi-square of three that one innovation in twenty exceeds: above, it gets less weight
 LAGS = 6  # blocks over which innovations depend on each other: the bounded velocity is no white noise
-MOST_SHAKING = 2.0  # noise of a block at rest, by that of the calmest stop before; idling motors have up to nine times that
 LEAST_DRIVEN_M_S, DRIVEN = 0.5, 11.3  # speed, and its chi-square, which a body at rest exceeds once in a hundred times
 DRIVEN_M_S = 2.0  # speed that is no error of the filter
 
