@@ -153,13 +153,14 @@ def test_a_stop_tells_the_bias_at_rest_from_that_in_motion(filtered: Filtered) -
         assert (std > 0.6 * GROUND[:3]).all(), "what differs at rest is not known yet"
 
 
-def test_a_car_that_speeds_up_on_a_straight_road_does_not_stop() -> None:
-    """An engine hides that the rate is not constant: a zero velocity at 15 m/s moved the bias by 20 mrad/s."""
+@pytest.mark.parametrize(("push_m_s2", "rate_rad_s"), [(1.0, 0.0), (0.0, 0.012)], ids=["speeds up", "bends"])
+def test_a_car_that_drives_steadily_does_not_stop(push_m_s2: float, rate_rad_s: float) -> None:
+    """An engine hides that the rate is not constant: stops at 15 m/s, or in a long bend, moved the bias by 20 mrad/s."""
     t_s, rng = np.arange(0.0, 40.0, 0.01), np.random.default_rng(0)
     drives = np.clip(t_s - 10.0, 0.0, 1.0)[:, None]
     engine = np.sin(2.0 * np.pi * (30.0 * t_s[:, None] + 0.1 * np.sin(t_s[:, None]) + [0.0, 0.3, 0.7])) * drives
-    gyro = 1e-3 * rng.normal(size=(4000, 3)) + 0.01 * engine
-    accel = [0.0, 0.0, 9.81] + 0.02 * rng.normal(size=(4000, 3)) + 0.3 * engine + np.outer(drives, [1.0, 0.0, 0.0])
+    gyro = 1e-3 * rng.normal(size=(4000, 3)) + 0.01 * engine + np.outer(drives, [0.0, 0.0, rate_rad_s])
+    accel = [0.0, 0.0, 9.81] + 0.02 * rng.normal(size=(4000, 3)) + 0.3 * engine + np.outer(drives, [push_m_s2, 0.0, 0.0])
     car = replace(KNOWN, settings=FilterSettings(speed_m_s=10.0, speed_correlation_s=5.0))
     blocks = list(filter_blocks(model(), [(t_s, gyro, accel)], car))
     assert [block.resting for block in blocks] == [block.start_s < 9.9 for block in blocks]
