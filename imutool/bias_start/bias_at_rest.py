@@ -31,8 +31,8 @@ from imutool.bias_start.initial_bias import (
 from imutool.bias_start.prior_width import MOST_DEVIATIONS, BiasPrior, supported_std, widened
 from imutool.errors import DataError
 from imutool.inertial.inertial_filter import LEAST_FORCE_M_S2
-from imutool.inertial.innovations import LEAST_DRIVEN_M_S, MOST_SHAKING
-from imutool.inertial.stationary import Blocks, rest_stretches, resting_blocks, white_noise
+from imutool.inertial.innovations import LEAST_DRIVEN_M_S
+from imutool.inertial.stationary import MOST_SHAKING, Blocks, rest_stretches, resting_blocks, white_noise
 from imutool.recording import GRAVITY_M_S2, Imu, nanoseconds
 from imutool.recording.columns import true_ranges
 

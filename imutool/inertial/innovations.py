@@ -9,14 +9,15 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.inertial.inertial_filter import Step
+from imutool.inertial.inertial_filter import SIZE, STILL, Step
+from imutool.inertial.stationary import MOST_SHAKING
 
 STUDENT = 7.0  # degrees of freedom of the likelihood, so that one jolt does not decide
 SURPRISING = 7.81  # chi-square of three that one innovation in twenty exceeds: above, it gets less weight
 LAGS = 6  # blocks over which innovations depend on each other: the bounded velocity is no white noise
-MOST_SHAKING = 2.0  # noise of a block at rest, by that of the calmest stop before; idling motors have up to nine times that
 LEAST_DRIVEN_M_S, DRIVEN = 0.5, 11.3  # speed, and its chi-square, which a body at rest exceeds once in a hundred times
 DRIVEN_M_S = 2.0  # speed that is no error of the filter
+TURNS = 25.0  # chi-square of a rate beside the bias so far, which no vibration makes
 
 
 class Innovations(NamedTuple):
@@ -47,8 +48,8 @@ def innovations(steps: Iterable[Step]) -> Innovations:
 class DriveDetector:
     """Detector of steady drives among blocks that look like rest.
 
-    A body that drives shakes more than at a stop before, and by the filter has speed: on a straight road the gyro shows nothing
-    else, and an engine hides that its rate is not constant.
+    A body that drives shakes more than at a stop before, and by the filter has speed, or a rate beside the bias so far. An
+    engine hides that this rate is not constant.
     """
 
     def __init__(self) -> None:
@@ -60,6 +61,10 @@ class DriveDetector:
         shakes, self._calmest = bool((noise > MOST_SHAKING * self._calmest).any()), np.minimum(noise, self._calmest)
         if not shakes or step.innovation is None:
             return False
+        rate = samples[:, :3].mean(axis=0) - step.expected.rest_bias(True)[:3]
+        of_rate = STILL @ step.expected.P[:SIZE, :SIZE] @ STILL.T + np.diag(samples[:, :3].var(axis=0) / len(samples))
+        if rate @ np.linalg.solve(of_rate, rate) > TURNS:
+            return True
         v_w, S = step.innovation
         speed = float(np.linalg.norm(v_w))
         return speed > DRIVEN_M_S or bool(speed > LEAST_DRIVEN_M_S and v_w @ np.linalg.solve(S, v_w) > DRIVEN)

@@ -38,10 +38,8 @@ MEANS, LEAST_MEANS = (20, 200), 8  # samples of a mean of noise, and how many me
 TOLERATED_MEAN = 1.8  # by which they may scatter more than noise is measured, which finds five sixths of it
 MOST_DRIFT = np.array([0.1] * 3 + [0.5] * 3)  # rad/s, m/s²: plausible sizes of a bias and of its drift
 KEPT_MEANS, COMPARED_MEANS = 1000, 100  # of windows at rest: kept by a live detector, and compared with each other
-REPEATED_RAD_S, OFTEN = (
-    4e-3,
-    0.25,
-)  # means that are alike; a rate that repeats a quarter as often as the commonest may be the bias
+MOST_SHAKING = 1.5  # noise at rest, by that of the calmest stop: white noise scatters to 1.3, idling cars drive with 1.9
+REPEATED_RAD_S, OFTEN = 4e-3, 0.05  # means that are alike; share of the commonest's windows that a bias has at least
 GAP_PERIODS = 3.0  # a longer step between samples breaks a window
 
 AT_ONCE = 1 << 14  # windows
@@ -103,10 +101,7 @@ def _blocks_of(t_ns: Int64[np.ndarray, " n"], u: Float64[np.ndarray, "n 6"], k: 
 
 
 def rest_stretches(imu: Imu, settings: StationarySettings | None = None) -> list[tuple[int, int]]:
-    """Rest stretches of at least `min_s` as ordered, disjoint index ranges `[start, end)`.
-
-    Empty for fewer samples than a window, or fewer than two per block.
-    """
+    """Rest stretches as ordered, disjoint index ranges `[start, end)`; none of too few samples."""
     if len(imu) < 2:
         return []
     parts = (slice(first, first + AT_ONCE) for first in range(0, len(imu), AT_ONCE))
@@ -128,7 +123,7 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
         return []
     gyro_scatter, gyro_variances, gyro_mean = _window_statistics(blocks.mean[:, :3], blocks.var[:, :3], width)
     accel_scatter, accel_variances, _ = _window_statistics(blocks.mean[:, 3:], blocks.var[:, 3:], width)
-    gyro_noise, accel_noise = (np.sqrt(variances.sum(axis=1)) for variances in (gyro_variances, accel_variances))
+    gyro_noise, accel_noise = noise = np.sqrt([variances.sum(axis=1) for variances in (gyro_variances, accel_variances)])
     half = width // 2
     halves = np.lib.stride_tricks.sliding_window_view(blocks.mean[:, :3], half, axis=0).mean(axis=-1)
     trend = np.linalg.norm(halves[width - half :] - halves[: len(gyro_scatter)], axis=1)
@@ -145,7 +140,8 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
         & ~np.lib.stride_tricks.sliding_window_view(blocks.late, width).any(axis=-1)
     )
     if rests.any():  # a turn-on bias does not jump: an outlier among the resting windows is a steady turn
-        rests &= np.linalg.norm(gyro_mean - _rate_at_rest(gyro_mean[rests]), axis=1) <= settings.gyro_agreement_rad_s
+        apart = np.linalg.norm(gyro_mean - _rate_at_rest(gyro_mean[rests], noise[:, rests]), axis=1)
+        rests &= apart <= settings.gyro_agreement_rad_s
     resting_blocks = np.zeros(count, bool)
     for shift in range(width):
         resting_blocks[shift : shift + len(rests)] |= rests
@@ -167,7 +163,7 @@ class OnlineRestDetector:
         self.blocks_needed = self.needed + 1
         self._last: tuple[Float64[np.ndarray, "parts 6"], Float64[np.ndarray, "parts 6"], int] | None = None
         self._calmest: list[float] = []
-        self._means: deque[Float64[np.ndarray, "3"]] = deque(maxlen=KEPT_MEANS)
+        self._means: deque[Float64[np.ndarray, "5"]] = deque(maxlen=KEPT_MEANS)  # and their noise
         self._windows, self._resting = 0, 0
 
     def __call__(self, gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"], *, whole: bool = True) -> bool:
@@ -209,16 +205,21 @@ class OnlineRestDetector:
         steady = trend <= s.gyro_trend_rad_s + TREND_DEVIATIONS * noise[0] * math.sqrt(2.0 / (half * k))
         if not (scatter[0] <= max(white, FLOOR_MARGIN * floor) and steady and np.linalg.norm(centre) <= s.gyro_mean_rad_s):
             return False
-        self._means.append(centre)
-        return bool(np.linalg.norm(centre - _rate_at_rest(np.array(self._means))) <= s.gyro_agreement_rad_s)
+        self._means.append(np.array([*centre, *noise]))
+        kept = np.array(self._means)
+        return bool(np.linalg.norm(centre - _rate_at_rest(kept[:, :3], kept[:, 3:].T)) <= s.gyro_agreement_rad_s)
 
 
-def _rate_at_rest(means: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3"]:
+def _rate_at_rest(means: Float64[np.ndarray, "n 3"], noise: Float64[np.ndarray, "2 n"]) -> Float64[np.ndarray, "3"]:
     """Rate that is the bias among those of windows that look like rest; the others are steady turns.
 
-    A bias repeats from window to window. A turn at a constant rate does so, too, but is mostly faster than a bias is large.
+    A bias repeats from window to window. A turn at a constant rate does so, too, but mostly shakes more, or is faster than a
+    bias is large.
     """
-    some = means[:: -(-len(means) // COMPARED_MEANS)]
+    calmest = np.sort(noise, axis=1)[:, min(FLOOR_RANK, len(means) // 10), None]
+    calm = means[(noise <= MOST_SHAKING * calmest).all(axis=0)]
+    calm = calm if len(calm) else means
+    some = calm[:: -(-len(calm) // COMPARED_MEANS)]
     alike = (np.linalg.norm(some[:, None] - some, axis=2) <= REPEATED_RAD_S).sum(axis=1)
     often = some[alike >= OFTEN * alike.max()]
     return np.asarray(often[np.argmin(np.linalg.norm(often, axis=1))])

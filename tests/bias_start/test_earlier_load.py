@@ -48,7 +48,7 @@ def warming() -> hybrid.Model:
             "theta_gyro": K.ravel(),
         },
     )
-    model.card = {"name": "warming"}
+    model.card = {"name": "warming", "logs": ["cold"]}
     return model
 
 

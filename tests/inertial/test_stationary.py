@@ -106,6 +106,17 @@ def test_a_camera_that_pans_for_longer_than_it_rests_rests_before(turn: np.ndarr
     assert told(gyro, accel) == [False] * 2 + [True] * 10 + [False] * 34
 
 
+@pytest.mark.parametrize(("rate", "for_s", "accel_noise"), [(-0.05, 20.0, 3.0), (0.1, 80.0, 1.0)], ids=["shaking", "long"])
+def test_a_table_that_turns_against_the_bias_or_for_long_rests_before(rate: float, for_s: float, accel_noise: float) -> None:
+    """A turn nearer to zero than the bias, or five times as long as the rest, was the rest: 50 to 100° with `static`."""
+    _, gyro, accel = made(6.0 + for_s)
+    gyro[1200:, 2] += rate
+    accel[1200:] = np.array([0.0, 0.0, GRAVITY_M_S2]) + accel_noise * (accel[1200:] - [0.0, 0.0, GRAVITY_M_S2])
+    (found,) = in_seconds(Imu(np.arange(len(gyro)) * 5_000_000, gyro, accel))
+    assert found == pytest.approx((0.0, 6.0), abs=EDGE_S)
+    assert told(gyro, accel) == [False] * 2 + [True] * 10 + [False] * (round(for_s) * 2)
+
+
 def test_a_steady_turn_too_fast_for_a_bias_is_not_rest():
     t_ns, gyro, accel = made(10.0)
     assert rest_stretches(Imu(t_ns, gyro + np.array([0.0, 0.0, 0.5]), accel)) == []
