@@ -15,6 +15,7 @@ import numpy as np
 
 from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.observability import exclude_each_other, values_of
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.unnamed_effects import plausible_part
@@ -93,12 +94,18 @@ def contradictions(logs: Sequence[WhitenedLog], selection: Selection) -> Iterato
     whole = fit(logs, chosen, found.part)
     while len({log.pair.name for log in whole.logs}) > 1:
         missed = {own: _missed(own, whole, always) for own in _by_log(whole)}
-        own = max(missed, key=lambda one: missed[one])
-        if missed[own] <= CONTRADICTS:
+        if max(missed.values()) <= CONTRADICTS:
             return
-        name = own.logs[0].pair.name
-        whole = fit([log for log in whole.logs if log.pair.name != name], chosen, found.part)
-        yield f"{name} contradicts the other logs: {_differing(own, whole)}. Diagnose it separately"
+        own, whole = _odd_one(missed, whole.logs, chosen, always)
+        yield f"{own.logs[0].pair.name} contradicts the other logs: {_differing(own, whole)}. Diagnose it separately"
+
+
+def _odd_one(missed: Mapping[Fit, float], logs: Sequence[WhitenedLog], chosen: Chosen, always: int) -> tuple[Fit, Fit]:
+    """The recording without which the others agree best, of two the one that misses more, and the fit of the others."""
+    entries = [(own, fit([log for log in logs if log not in own.logs], chosen, own.part)) for own in missed]
+    if len(entries) == 2:
+        return max(entries, key=lambda entry: missed[entry[0]])
+    return min(entries, key=lambda entry: max(_missed(one, entry[1], always) for one in missed if one is not entry[0]))
 
 
 def _by_log(whole: Fit) -> Iterator[Fit]:

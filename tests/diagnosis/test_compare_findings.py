@@ -27,10 +27,18 @@ def finding(effect: str = "gyro_scale", x: float = 0.02, std: float = 1e-4, **mo
     return replace(found, **more)
 
 
-def log(folder: Path, name: str, seed: int, effects: Mapping[str, Sequence[float]], *, poses: bool = True) -> Path:
-    felt = planted.rich(seed)
+def log(
+    folder: Path,
+    name: str,
+    seed: int,
+    effects: Mapping[str, Sequence[float]],
+    *,
+    poses: bool = True,
+    long_s: float = planted.DURATION_S,
+) -> Path:
+    felt = planted.rich(seed, long_s)
     samples = planted.ideal(felt, planted.acting(effects)) + planted.noise(len(felt.t_s), seed) + planted.BIAS
-    truth = planted.poses(planted.moving(seed), planted.clock(rate_hz=200.0)) if poses else None
+    truth = planted.poses(planted.moving(seed, long_s), planted.clock(long_s, 200.0)) if poses else None
     path = folder / f"{name}.mcap"
     write(planted.recording(name, felt.t_s, samples, poses=truth), path)
     return path
@@ -151,9 +159,11 @@ def test_a_simulation_of_the_motion_of_some_recordings_only_is_refused(tmp_path:
         diagnose(reals, log(tmp_path, "sim", 7, {}))
 
 
-def test_a_recording_that_contradicts_the_others_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("long_s", [planted.DURATION_S, 150.0])
+def test_a_recording_that_contradicts_the_others_is_named(long_s: float, tmp_path: Path) -> None:
+    """Also one that outweighs the others."""
     of_one_unit = [log(tmp_path, f"log{seed}", seed, {"gyro_scale": SCALE}) for seed in (3, 7)]
-    of_another = log(tmp_path, "stranger", 11, {"gyro_scale": [-0.02, 0.01, 0.03]})
+    of_another = log(tmp_path, "stranger", 11, {"gyro_scale": [-0.02, 0.01, 0.03]}, long_s=long_s)
     assert contradicting(diagnose(of_one_unit)) == []
     found = diagnose([*of_one_unit, of_another])
     (remark,) = contradicting(found)
