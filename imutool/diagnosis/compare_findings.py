@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
@@ -28,7 +29,7 @@ ALIKE_STD = 4.5  # joint deviations: chance exceeds them in 0.5 % (Student's t o
 ALIKE_SHARE = (
     0.03  # of the largest number: smoothed poses lack a per cent of either motion. Alike is what is within one of both
 )
-CONTRADICTS = 0.15  # of what own numbers leave of a log and of what they explain; logs of one real unit miss both by up to 0.04
+CONTRADICTS = 0.15  # of what own numbers leave of an axis and of what they explain; logs of one real unit miss up to 0.07
 READING = {"gyro": "omega", "accel": "f"}  # what a sensor reads, as equations write it
 OF_READING = (  # or of its rest, where rounding errs by a constant
     *("gyro_scale_asymmetry", "accel_scale_asymmetry", "gyro_hysteresis", "accel_hysteresis", "gyro_dead_band"),
@@ -119,17 +120,20 @@ def _by_log(whole: Fit) -> Iterator[Fit]:
 
 
 def _missed(own: Fit, whole: Fit, always: int) -> float:
-    """Squares that a recording loses by the numbers of all, over those that its own leave, or explain."""
-    without = fit(own.logs, own.chosen[:always], own.part)
-    left = sum(_squares(whole, whole.logs.index(log)) for log in own.logs) - sum(_squares(own, k) for k in range(len(own.logs)))
-    return left / max(own.objective, without.objective - own.objective)
+    """Squares that an axis of a recording loses by the numbers of all, over those that its own leave, or explain there."""
+    without, left = fit(own.logs, own.chosen[:always], own.part), _squares(own, own.logs)
+    return float(
+        ((_squares(whole, own.logs) - left) / np.maximum(np.maximum(left, _squares(without, own.logs) - left), 1.0)).max()
+    )
 
 
-def _squares(found: Fit, log: int) -> float:
-    """Squares that a fit leaves of one log."""
-    white = found.logs[log]
-    rows = white.rows(found.part)
-    return float(((found.residuals[log][rows] - white.constants[rows] * found.bias[log]) ** 2).sum())
+def _squares(found: Fit, logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, " k"]:
+    """Squares that a fit leaves of some of its logs, by axis."""
+    total = np.zeros(logs[0].pair.columns)
+    for log in logs:
+        k, rows = found.logs.index(log), log.rows(found.part)
+        total += ((found.residuals[k][rows] - log.constants[rows] * found.bias[k]) ** 2).sum(axis=0)
+    return total
 
 
 def _differing(own: Fit, others: Fit) -> str:

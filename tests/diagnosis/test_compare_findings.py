@@ -159,11 +159,14 @@ def test_a_simulation_of_the_motion_of_some_recordings_only_is_refused(tmp_path:
         diagnose(reals, log(tmp_path, "sim", 7, {}))
 
 
-@pytest.mark.parametrize("long_s", [planted.DURATION_S, 150.0])
-def test_a_recording_that_contradicts_the_others_is_named(long_s: float, tmp_path: Path) -> None:
-    """Also one that outweighs the others."""
+@pytest.mark.parametrize(
+    ("stranger", "long_s"),
+    [([-0.02, 0.01, 0.03], planted.DURATION_S), ([-0.02, 0.01, 0.03], 150.0), ([0.02, 0.006, -0.015], 24.0)],
+)
+def test_a_recording_that_contradicts_the_others_is_named(stranger: list[float], long_s: float, tmp_path: Path) -> None:
+    """Also one that outweighs the others, or that differs on one axis alone."""
     of_one_unit = [log(tmp_path, f"log{seed}", seed, {"gyro_scale": SCALE}) for seed in (3, 7)]
-    of_another = log(tmp_path, "stranger", 11, {"gyro_scale": [-0.02, 0.01, 0.03]}, long_s=long_s)
+    of_another = log(tmp_path, "stranger", 11, {"gyro_scale": stranger}, long_s=long_s)
     assert contradicting(diagnose(of_one_unit)) == []
     found = diagnose([*of_one_unit, of_another])
     (remark,) = contradicting(found)
