@@ -16,7 +16,7 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.jacobians import Chosen
+from imutool.diagnosis.estimation.jacobians import Chosen, free
 from imutool.diagnosis.estimation.observability import exclude_each_other, values_of
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.unnamed_effects import plausible_part
@@ -88,17 +88,17 @@ def contradictions(logs: Sequence[WhitenedLog], selection: Selection) -> Iterato
     Numbers in which units and mounts differ are fitted beside the findings: what only some recordings have is not among these.
     """
     found, always = selection.whole, selection.always
-    free = [
+    beside = [
         effect for effect in catalogue.diagnosed(OF_UNIT) if not any(exclude_each_other(effect, one) for one, _ in found.chosen)
     ]
-    chosen = (*found.chosen, *((effect, effect.null_value.astype(float)) for effect in free))
+    chosen = (*found.chosen, *((effect, effect.null_value.astype(float)) for effect in beside))
     whole = fit(logs, chosen, found.part)
     while len({log.pair.name for log in whole.logs}) > 1:
         missed = {own: _missed(own, whole, always) for own in _by_log(whole)}
         if max(missed.values()) <= CONTRADICTS:
             return
         own, whole = _odd_one(missed, whole.logs, chosen, always)
-        yield f"{own.logs[0].pair.name} contradicts the other logs: {_differing(own, whole)}. Diagnose it separately"
+        yield f"{own.logs[0].pair.name} contradicts the other logs: {_differing(own, whole, found)}. Diagnose it separately"
 
 
 def _odd_one(missed: Mapping[Fit, float], logs: Sequence[WhitenedLog], chosen: Chosen, always: int) -> tuple[Fit, Fit]:
@@ -136,14 +136,20 @@ def _squares(found: Fit, logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, " k
     return total
 
 
-def _differing(own: Fit, others: Fit) -> str:
-    """The effect whose numbers differ most from those of the other recordings, and both numbers."""
-    std, theta = own.stds(), dict(zip(others.keys, others.chosen, strict=True))
-    apart = {}
+def _differing(own: Fit, others: Fit, found: Fit) -> str:
+    """The effect whose own numbers explain most beside those of the others, and both numbers, fitted beside the findings."""
+    theta, pull = dict(zip(others.keys, others.chosen, strict=True)), np.zeros(len(own.information))
     for effect, mine in own.chosen:
         theirs = values_of(theta[effect.key][0], effect, theta[effect.key][1])
-        apart[effect.key] = float((np.abs(mine - theirs) / np.maximum(std[effect.key], 1e-300)).max(initial=0.0))
-    key = max(apart, key=lambda name: apart[name])
+        off = np.nan_to_num(free(effect, mine) - free(effect, theirs))
+        pull += own.information[:, own.place(effect.key)] @ off
+    parts = {key: own.place(key) for key in own.keys}
+    gain = {key: float(pull[at] @ np.linalg.pinv(own.information[at, at]) @ pull[at]) for key, at in parts.items()}
+    key = max(gain, key=lambda name: gain[name])
+    own, others = (
+        fit(one.logs, tuple(entry for entry in one.chosen if entry[0].key in (key, *found.keys)), one.part)
+        for one in (own, others)
+    )
     return f"its {key.replace('_', ' ')} is {_numbers_of(own, key)}, theirs {_numbers_of(others, key)}"
 
 

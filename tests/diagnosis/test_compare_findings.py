@@ -160,18 +160,27 @@ def test_a_simulation_of_the_motion_of_some_recordings_only_is_refused(tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("stranger", "long_s"),
-    [([-0.02, 0.01, 0.03], planted.DURATION_S), ([-0.02, 0.01, 0.03], 150.0), ([0.02, 0.006, -0.015], 24.0)],
+    ("differs", "stranger", "long_s"),
+    [
+        ("gyro_scale", {"gyro_scale": [-0.02, 0.01, 0.03]}, 150.0),
+        ("gyro_scale", {"gyro_scale": [0.02, 0.006, -0.015]}, planted.DURATION_S),
+        ("mount_rotation", {"gyro_scale": SCALE, "mount_rotation": [0.05, 0.0, 0.0]}, planted.DURATION_S),
+    ],
 )
-def test_a_recording_that_contradicts_the_others_is_named(stranger: list[float], long_s: float, tmp_path: Path) -> None:
-    """Also one that outweighs the others, or that differs on one axis alone."""
-    of_one_unit = [log(tmp_path, f"log{seed}", seed, {"gyro_scale": SCALE}) for seed in (3, 7)]
-    of_another = log(tmp_path, "stranger", 11, {"gyro_scale": stranger}, long_s=long_s)
-    assert contradicting(diagnose(of_one_unit)) == []
+def test_a_recording_that_contradicts_the_others_is_named(
+    differs: str, stranger: Mapping[str, Sequence[float]], long_s: float, tmp_path: Path
+) -> None:
+    """Also one that outweighs the others, that differs on one axis alone, or in what two matrices would do as well."""
+    of_one_unit = logs_of_one_unit(tmp_path)
+    of_another = log(tmp_path, "stranger", 11, stranger, long_s=long_s)
     found = diagnose([*of_one_unit, of_another])
     (remark,) = contradicting(found)
-    assert remark.startswith("stranger contradicts the other logs: its gyro scale is ")
+    assert remark.startswith(f"stranger contradicts the other logs: its {differs.replace('_', ' ')} is ")
     assert remark == found.remarks[0]
+
+
+def test_recordings_of_one_unit_do_not_contradict_each_other(tmp_path: Path) -> None:
+    assert contradicting(diagnose(logs_of_one_unit(tmp_path))) == []
 
 
 def test_logs_that_state_different_sensors_are_refused(tmp_path: Path) -> None:
@@ -182,6 +191,10 @@ def test_logs_that_state_different_sensors_are_refused(tmp_path: Path) -> None:
         write(replace(one, metadata={"imutool": {"sensor": path.stem}}), path)
     with pytest.raises(DataError, match=r"different sensors \(bmi160: bmi160, adis16448: adis16448\)"):
         diagnose(paths)
+
+
+def logs_of_one_unit(folder: Path) -> list[Path]:
+    return [log(folder, f"log{seed}", seed, {"gyro_scale": SCALE}) for seed in (3, 7)]
 
 
 def contradicting(found: Diagnosis) -> list[str]:
