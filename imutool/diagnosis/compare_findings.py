@@ -88,8 +88,9 @@ def contradictions(logs: Sequence[WhitenedLog], selection: Selection) -> Iterato
     Numbers in which units and mounts differ are fitted beside the findings: what only some recordings have is not among these.
     """
     found, always = selection.whole, selection.always
+    names = (*OF_UNIT, "clock_offset") if all(log.pair.exact for log in logs) else OF_UNIT  # poses have a clock of their own
     beside = [
-        effect for effect in catalogue.diagnosed(OF_UNIT) if not any(exclude_each_other(effect, one) for one, _ in found.chosen)
+        effect for effect in catalogue.diagnosed(names) if not any(exclude_each_other(effect, one) for one, _ in found.chosen)
     ]
     chosen = (*found.chosen, *((effect, effect.null_value.astype(float)) for effect in beside))
     whole = fit(logs, chosen, found.part)

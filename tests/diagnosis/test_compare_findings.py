@@ -179,6 +179,20 @@ def test_a_recording_that_contradicts_the_others_is_named(
     assert remark == found.remarks[0]
 
 
+def test_a_recording_of_another_clock_is_named_by_its_clock(tmp_path: Path) -> None:
+    """Beside one simulation of all three; two matrices do a part of it."""
+    felt, paths = planted.rich(3, 60.0), []
+    for name, late_s in (("first", 0.0), ("second", 0.0), ("third", 0.02), ("sim", None)):
+        effects = {} if late_s is None else {"gyro_scale": SCALE, "clock_offset": [late_s]}
+        samples = planted.ideal(felt, planted.acting(effects)) + planted.noise(len(felt.t_s), len(paths))
+        k = len(paths)
+        part = slice(None) if late_s is None else (felt.t_s > 20.0 * k) & (felt.t_s < 20.0 * k + 19.0)
+        write(planted.recording(name, felt.t_s[part], samples[part]), tmp_path / f"{name}.mcap")
+        paths.append(tmp_path / f"{name}.mcap")
+    (remark,) = contradicting(diagnose(paths[:3], paths[3]))
+    assert remark.startswith("third contradicts the other logs: its clock offset is tau ")
+
+
 def test_recordings_of_one_unit_do_not_contradict_each_other(tmp_path: Path) -> None:
     assert contradicting(diagnose(logs_of_one_unit(tmp_path))) == []
 
