@@ -13,8 +13,10 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.jacobians import Chosen, free
 from imutool.diagnosis.estimation.observability import exclude_each_other, values_of
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.unnamed_effects import plausible_part
@@ -27,7 +29,7 @@ ALIKE_STD = 4.5  # joint deviations: chance exceeds them in 0.5 % (Student's t o
 ALIKE_SHARE = (
     0.03  # of the largest number: smoothed poses lack a per cent of either motion. Alike is what is within one of both
 )
-CONTRADICTS = 0.15  # of what own numbers leave of a log and of what they explain; logs of one real unit miss both by up to 0.04
+CONTRADICTS = 0.15  # of what own numbers leave of an axis and of what they explain; logs of one real unit miss up to 0.07
 READING = {"gyro": "omega", "accel": "f"}  # what a sensor reads, as equations write it
 OF_READING = (  # or of its rest, where rounding errs by a constant
     *("gyro_scale_asymmetry", "accel_scale_asymmetry", "gyro_hysteresis", "accel_hysteresis", "gyro_dead_band"),
@@ -86,19 +88,26 @@ def contradictions(logs: Sequence[WhitenedLog], selection: Selection) -> Iterato
     Numbers in which units and mounts differ are fitted beside the findings: what only some recordings have is not among these.
     """
     found, always = selection.whole, selection.always
-    free = [
-        effect for effect in catalogue.diagnosed(OF_UNIT) if not any(exclude_each_other(effect, one) for one, _ in found.chosen)
+    names = (*OF_UNIT, "clock_offset") if all(log.pair.exact for log in logs) else OF_UNIT  # poses have a clock of their own
+    beside = [
+        effect for effect in catalogue.diagnosed(names) if not any(exclude_each_other(effect, one) for one, _ in found.chosen)
     ]
-    chosen = (*found.chosen, *((effect, effect.null_value.astype(float)) for effect in free))
+    chosen = (*found.chosen, *((effect, effect.null_value.astype(float)) for effect in beside))
     whole = fit(logs, chosen, found.part)
     while len({log.pair.name for log in whole.logs}) > 1:
         missed = {own: _missed(own, whole, always) for own in _by_log(whole)}
-        own = max(missed, key=lambda one: missed[one])
-        if missed[own] <= CONTRADICTS:
+        if max(missed.values()) <= CONTRADICTS:
             return
-        name = own.logs[0].pair.name
-        whole = fit([log for log in whole.logs if log.pair.name != name], chosen, found.part)
-        yield f"{name} contradicts the other logs: {_differing(own, whole)}. Diagnose it separately"
+        own, whole = _odd_one(missed, whole.logs, chosen, always)
+        yield f"{own.logs[0].pair.name} contradicts the other logs: {_differing(own, whole, found)}. Diagnose it separately"
+
+
+def _odd_one(missed: Mapping[Fit, float], logs: Sequence[WhitenedLog], chosen: Chosen, always: int) -> tuple[Fit, Fit]:
+    """The recording without which the others agree best, of two the one that misses more, and the fit of the others."""
+    entries = [(own, fit([log for log in logs if log not in own.logs], chosen, own.part)) for own in missed]
+    if len(entries) == 2:
+        return max(entries, key=lambda entry: missed[entry[0]])
+    return min(entries, key=lambda entry: max(_missed(one, entry[1], always) for one in missed if one is not entry[0]))
 
 
 def _by_log(whole: Fit) -> Iterator[Fit]:
@@ -112,27 +121,36 @@ def _by_log(whole: Fit) -> Iterator[Fit]:
 
 
 def _missed(own: Fit, whole: Fit, always: int) -> float:
-    """Squares that a recording loses by the numbers of all, over those that its own leave, or explain."""
-    without = fit(own.logs, own.chosen[:always], own.part)
-    left = sum(_squares(whole, whole.logs.index(log)) for log in own.logs) - sum(_squares(own, k) for k in range(len(own.logs)))
-    return left / max(own.objective, without.objective - own.objective)
+    """Squares that an axis of a recording loses by the numbers of all, over those that its own leave, or explain there."""
+    without, left = fit(own.logs, own.chosen[:always], own.part), _squares(own, own.logs)
+    return float(
+        ((_squares(whole, own.logs) - left) / np.maximum(np.maximum(left, _squares(without, own.logs) - left), 1.0)).max()
+    )
 
 
-def _squares(found: Fit, log: int) -> float:
-    """Squares that a fit leaves of one log."""
-    white = found.logs[log]
-    rows = white.rows(found.part)
-    return float(((found.residuals[log][rows] - white.constants[rows] * found.bias[log]) ** 2).sum())
+def _squares(found: Fit, logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, " k"]:
+    """Squares that a fit leaves of some of its logs, by axis."""
+    total = np.zeros(logs[0].pair.columns)
+    for log in logs:
+        k, rows = found.logs.index(log), log.rows(found.part)
+        total += ((found.residuals[k][rows] - log.constants[rows] * found.bias[k]) ** 2).sum(axis=0)
+    return total
 
 
-def _differing(own: Fit, others: Fit) -> str:
-    """The effect whose numbers differ most from those of the other recordings, and both numbers."""
-    std, theta = own.stds(), dict(zip(others.keys, others.chosen, strict=True))
-    apart = {}
+def _differing(own: Fit, others: Fit, found: Fit) -> str:
+    """The effect whose own numbers explain most beside those of the others, and both numbers, fitted beside the findings."""
+    theta, pull = dict(zip(others.keys, others.chosen, strict=True)), np.zeros(len(own.information))
     for effect, mine in own.chosen:
         theirs = values_of(theta[effect.key][0], effect, theta[effect.key][1])
-        apart[effect.key] = float((np.abs(mine - theirs) / np.maximum(std[effect.key], 1e-300)).max(initial=0.0))
-    key = max(apart, key=lambda name: apart[name])
+        off = np.nan_to_num(free(effect, mine) - free(effect, theirs))
+        pull += own.information[:, own.place(effect.key)] @ off
+    parts = {key: own.place(key) for key in own.keys}
+    gain = {key: float(pull[at] @ np.linalg.pinv(own.information[at, at]) @ pull[at]) for key, at in parts.items()}
+    key = max(gain, key=lambda name: gain[name])
+    own, others = (
+        fit(one.logs, tuple(entry for entry in one.chosen if entry[0].key in (key, *found.keys)), one.part)
+        for one in (own, others)
+    )
     return f"its {key.replace('_', ' ')} is {_numbers_of(own, key)}, theirs {_numbers_of(others, key)}"
 
 

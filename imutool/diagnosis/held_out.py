@@ -161,7 +161,7 @@ def ringing(logs: Sequence[WhitenedImu], after: Sequence[np.ndarray], settings: 
         return []
     (log,), rate_hz = logs, 1.0 / logs[0].pair.period_s
     rows = np.asarray(log.pair.usable.any(axis=1))
-    residual = np.where(rows[:, None], log.pair.real - after[0], 0.0)[:, 3:][:, log.pair.axes[3:]]
+    residual = np.where(log.pair.usable, log.pair.real - after[0], 0.0)[:, 3:][:, log.pair.axes[3:]]  # limits do not ring
     residual = residual - residual.mean(axis=0)
     f_hz, power = welch(residual, rate_hz, nperseg=min(settings.segment_samples, len(residual)), axis=0)
     total = power.sum(axis=1)

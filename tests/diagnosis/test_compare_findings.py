@@ -27,10 +27,18 @@ def finding(effect: str = "gyro_scale", x: float = 0.02, std: float = 1e-4, **mo
     return replace(found, **more)
 
 
-def log(folder: Path, name: str, seed: int, effects: Mapping[str, Sequence[float]], *, poses: bool = True) -> Path:
-    felt = planted.rich(seed)
+def log(
+    folder: Path,
+    name: str,
+    seed: int,
+    effects: Mapping[str, Sequence[float]],
+    *,
+    poses: bool = True,
+    long_s: float = planted.DURATION_S,
+) -> Path:
+    felt = planted.rich(seed, long_s)
     samples = planted.ideal(felt, planted.acting(effects)) + planted.noise(len(felt.t_s), seed) + planted.BIAS
-    truth = planted.poses(planted.moving(seed), planted.clock(rate_hz=200.0)) if poses else None
+    truth = planted.poses(planted.moving(seed, long_s), planted.clock(long_s, 200.0)) if poses else None
     path = folder / f"{name}.mcap"
     write(planted.recording(name, felt.t_s, samples, poses=truth), path)
     return path
@@ -151,14 +159,42 @@ def test_a_simulation_of_the_motion_of_some_recordings_only_is_refused(tmp_path:
         diagnose(reals, log(tmp_path, "sim", 7, {}))
 
 
-def test_a_recording_that_contradicts_the_others_is_named(tmp_path: Path) -> None:
-    of_one_unit = [log(tmp_path, f"log{seed}", seed, {"gyro_scale": SCALE}) for seed in (3, 7)]
-    of_another = log(tmp_path, "stranger", 11, {"gyro_scale": [-0.02, 0.01, 0.03]})
-    assert contradicting(diagnose(of_one_unit)) == []
+@pytest.mark.parametrize(
+    ("differs", "stranger", "long_s"),
+    [
+        ("gyro_scale", {"gyro_scale": [-0.02, 0.01, 0.03]}, 150.0),
+        ("gyro_scale", {"gyro_scale": [0.02, 0.006, -0.015]}, planted.DURATION_S),
+        ("mount_rotation", {"gyro_scale": SCALE, "mount_rotation": [0.05, 0.0, 0.0]}, planted.DURATION_S),
+    ],
+)
+def test_a_recording_that_contradicts_the_others_is_named(
+    differs: str, stranger: Mapping[str, Sequence[float]], long_s: float, tmp_path: Path
+) -> None:
+    """Also one that outweighs the others, that differs on one axis alone, or in what two matrices would do as well."""
+    of_one_unit = logs_of_one_unit(tmp_path)
+    of_another = log(tmp_path, "stranger", 11, stranger, long_s=long_s)
     found = diagnose([*of_one_unit, of_another])
     (remark,) = contradicting(found)
-    assert remark.startswith("stranger contradicts the other logs: its gyro scale is ")
+    assert remark.startswith(f"stranger contradicts the other logs: its {differs.replace('_', ' ')} is ")
     assert remark == found.remarks[0]
+
+
+def test_a_recording_of_another_clock_is_named_by_its_clock(tmp_path: Path) -> None:
+    """Beside one simulation of all three; two matrices do a part of it."""
+    felt, paths = planted.rich(3, 60.0), []
+    for name, late_s in (("first", 0.0), ("second", 0.0), ("third", 0.02), ("sim", None)):
+        effects = {} if late_s is None else {"gyro_scale": SCALE, "clock_offset": [late_s]}
+        samples = planted.ideal(felt, planted.acting(effects)) + planted.noise(len(felt.t_s), len(paths))
+        k = len(paths)
+        part = slice(None) if late_s is None else (felt.t_s > 20.0 * k) & (felt.t_s < 20.0 * k + 19.0)
+        write(planted.recording(name, felt.t_s[part], samples[part]), tmp_path / f"{name}.mcap")
+        paths.append(tmp_path / f"{name}.mcap")
+    (remark,) = contradicting(diagnose(paths[:3], paths[3]))
+    assert remark.startswith("third contradicts the other logs: its clock offset is tau ")
+
+
+def test_recordings_of_one_unit_do_not_contradict_each_other(tmp_path: Path) -> None:
+    assert contradicting(diagnose(logs_of_one_unit(tmp_path))) == []
 
 
 def test_logs_that_state_different_sensors_are_refused(tmp_path: Path) -> None:
@@ -169,6 +205,10 @@ def test_logs_that_state_different_sensors_are_refused(tmp_path: Path) -> None:
         write(replace(one, metadata={"imutool": {"sensor": path.stem}}), path)
     with pytest.raises(DataError, match=r"different sensors \(bmi160: bmi160, adis16448: adis16448\)"):
         diagnose(paths)
+
+
+def logs_of_one_unit(folder: Path) -> list[Path]:
+    return [log(folder, f"log{seed}", seed, {"gyro_scale": SCALE}) for seed in (3, 7)]
 
 
 def contradicting(found: Diagnosis) -> list[str]:

@@ -67,6 +67,14 @@ def test_rotors_whose_speeds_wander_do_not_ring(seed: int) -> None:
     assert found(added) == []
 
 
+def test_what_an_axis_reads_at_its_limit_does_not_ring() -> None:
+    """Such samples are no measurement, though those of the other axes are."""
+    pair, beyond = planted.pair(planted.rich()), np.zeros((len(planted.clock()), 6))
+    beyond[:, 3:] = shocks(7.0, 0.12)
+    log = planted.weighed(replace(pair, real=pair.real + beyond, known=np.abs(beyond) < 0.1))
+    assert ringing([log], [expected(pair, ())], RingingSettings()) == []
+
+
 def test_no_noise_is_larger_than_what_is_left() -> None:
     """It is measured before the effects are known, and what a filter takes at high frequencies counted."""
     pair = planted.pair(planted.rich())

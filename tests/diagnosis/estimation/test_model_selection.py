@@ -660,6 +660,15 @@ def test_a_clock_wanders_beside_poses_only_where_offset_skew_and_jump_do_not_say
         assert sure(found, name, theta[:knots] if name == "clock_wander" else theta)
 
 
+@pytest.mark.parametrize(("f0", "seed"), [(10.0, 0), (10.0, 2), (18.0, 1)])
+def test_slow_motion_leaves_the_frequency_of_a_resonance_open(f0: float, seed: int) -> None:
+    """Each of many frequencies is a narrow peak of the likelihood: one alone was 20 deviations off and more."""
+    truth = {"mount_resonance": [f0, 0.1, 1.0, 1.0, 1.0]}
+    effects = [effect for effect, _ in planted.acting(truth)]
+    (found,) = select_effects([planted.weighed(planted.pair(planted.shaken(), truth, seed))], effects).selected
+    assert abs(found.theta[0] - f0) < SURE * found.std[0]
+
+
 def test_a_lever_arm_beside_a_resonance_is_not_called_a_size_effect() -> None:
     """On level ground nine numbers do what three do, and a little more as long as nobody thinks of the resonance."""
     pair = planted.pair(planted.planar(), {"lever_arm": [-0.4, -0.9, 0.0], "mount_resonance": [3.0, 0.2, 0.3, 1.0, 0.0]})

@@ -39,10 +39,12 @@ from imutool.diagnosis.estimation.unnamed_effects import has_no_size, plausible_
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked, of_each
-from imutool.sensor.effect import Effect
+from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.effects.low_pass import Design
 
 HYSTERESES = ("gyro_hysteresis", "accel_hysteresis")
+OTHER_F0 = np.delete(2.0 ** (np.arange(-8, 17) / 8.0), 8)  # of the fitted one, at which the search of other peaks begins
+AS_LIKELY = 9.0  # squares more: three deviations
 
 
 @dataclass(eq=False)
@@ -198,9 +200,29 @@ class Trial:
         )
         if no_answer or has_no_size(effect, theta, std, curve=(curve := isinstance(effect.forward, SplineCurve))):
             return None
+        if effect.name == "mount_resonance":
+            std = np.hypot(std, _off_other_peaks(whole, k, 1.0 if scattered is None else scattered.inflation[effect.key]))
         log_p = self.candidates.log_p(effect, gain[1])
         if scattered is not None:
             log_p = max(log_p, scattered.log_p_value(effect.key, gain[1], len(theta)) + self.candidates.log_choices[effect.key])
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
         vague = tuple(unidentified(effect, theta, std, curve=curve))
         return SelectedEffect(effect, theta, std, vague, float(np.exp(max(log_p, -700))), rate, gain[0]) if rate < 1.0 else None
+
+
+def _off_other_peaks(whole: Fit, k: int, inflation: float) -> Theta:
+    """How far a resonance is off other likely ones: the root of mean squares, by parameter.
+
+    Motion far below f0 shows share / f0^2 and share zeta / f0^3. What rings shows f0 itself, and a weak ringing fits noise at
+    many f0, each of them a narrow peak.
+    """
+    (effect, theta), least, off = whole.chosen[k], whole.objective, [np.zeros(len(whole.chosen[k][1]))]
+    squares = [least]
+    for ratio in OTHER_F0:
+        begun = (effect, theta * np.array([ratio, ratio, *[ratio**2] * (len(theta) - 2)]))
+        others = (*whole.chosen[:k], begun, *whole.chosen[k + 1 :])
+        there = fit(whole.logs, others, part=whole.part, give_up_above=least + AS_LIKELY * inflation)
+        squares.append(there.objective)
+        off.append(there.chosen[k][1] - theta)
+    likely = np.exp((min(squares) - np.array(squares)) / (2.0 * inflation))
+    return np.asarray(np.sqrt(likely @ np.array(off) ** 2 / likely.sum()))
