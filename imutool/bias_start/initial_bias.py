@@ -50,7 +50,7 @@ LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # with a prior of zero variance n
 SESSION_GAP_S = 6 * 3600.0  # a longer pause is another switching-on
 NOT_SWITCHED = 0.5  # probability that a sensor stayed on within these hours
 PRIOR, TRACKED_BY = "prior of the training runs", "gravity in motion and every stop"
-UNKNOWN_BODY = {"speed_m_s": 10.0, "speed_correlation_s": 1.0}  # with 3 m/s over 0.5 s cars and trains had twice the error
+UNKNOWN_BODY = {"speed_m_s": 10.0, "speed_correlation_s": 0.5}  # with 3 m/s cars had twice the error, drones a twelfth less
 STEP_S = 1.0  # of the covariance of a constant rest bias, whose dynamics take minutes
 
 METHODS = ("auto", "stationary", "prior", "truth")
