@@ -159,9 +159,7 @@ class _Problem:
             passes.append(ForwardPass(log.pair, chosen, None if like is None else like.passes[k]))
             known = None if like is None else (like.passes[k].blocks, like.residuals[k])
             residuals.append(log.residual(passes[k].blocks, known))
-        total = (
-            float(np.vdot(off := (free_of(chosen) - self.mean) / self.std, off)) if len(self.mean) else 0.0
-        )  # inf is no warning
+        total = float(np.vdot(off := (free_of(chosen) - self.mean) / self.std, off)) if len(self.mean) else 0.0
         bias = np.zeros((len(self.logs), self.logs[0].pair.columns))
         for k, (log, residual, mask) in enumerate(zip(self.logs, residuals, self.masks, strict=True)):
             for axis, (constant, prior) in enumerate(zip(self.constants[k], log.pair.bias_std, strict=True)):
