@@ -140,7 +140,7 @@ def _evaluated(
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     recorded = [(RAW, recording.imu, None, None)]
     recorded += [] if debiased is None else [(str(about.get("model") or "debiased"), debiased, None, None)]
-    found = started(recording, models, init, log, smooth=smooth, refused=refused)
+    found = started(recording, models, init, log, smooth=smooth, refused=refused, force=True)
     span: TrueSpan | None = None
     for name, imu, model, start in [*recorded, *((name, recording.imu, model, start) for name, model, start in found)]:
         if span is None or imu is not recording.imu:
@@ -240,7 +240,7 @@ def runs(
 ) -> Iterator[tuple[str, DebiasedImu, InitialBias | None]]:
     """Samples as recorded, then corrected by each model: name, samples and bias, initial bias."""
     yield RAW, DebiasedImu(recording.imu, np.zeros((len(recording.imu), 6))), None
-    for name, model, start in started(recording, models, init, where):
+    for name, model, start in started(recording, models, init, where, force=True):
         yield name, apply(model, start, recording.imu), start
 
 
@@ -252,7 +252,7 @@ def started(
     *,
     smooth: bool = False,
     refused: Refused | None = None,
-    force: bool = True,
+    force: bool = False,
 ) -> Iterator[tuple[str, BiasModel, InitialBias]]:
     """Model name, model and initial bias in this recording, for each requested model.
 

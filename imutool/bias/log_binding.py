@@ -17,7 +17,7 @@ from imutool.recording import Imu, Scalars
 from imutool.sensor.signals import TEMPERATURE_TERMS
 
 RATE_TOLERANCE = 0.05  # a real rate differs from its nominal one by a few per mille (BMI160: 199.4 for 200)
-MOST_FACTOR = 4.5  # between the rates of training and log
+MOST_FACTOR = 4.5  # between the rates of training and log: four, as means of four samples were tried, and some drift
 BATCHES = "The stamps come in batches: imutool convert LOG OUT --restamp puts them on the clock of the sensor"
 MOST_AGE_S = 60.0  # of a number of the channel: a case warms within minutes
 SET_BACK = 2  # half seconds: further back the clock was set, and the sample is not late
@@ -43,7 +43,9 @@ def at_rate(model: BiasModel, rate_hz: float, where: object, t_ns: Stamps | None
     batches = abs(mean_hz / model.rate_hz - 1) < RATE_TOLERANCE
     possible = not (batches or model.counts_samples) and 1 / MOST_FACTOR < rate_hz / model.rate_hz < MOST_FACTOR
     if possible and force:
-        return model.at(rate_hz)
+        out = model.at(rate_hz)
+        out.remarks = (*model.remarks, f"samples at {rate_hz:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
+        return out
     what = f"IMU at {rate_hz:.1f} Hz{f' by most of its steps, and {mean_hz:.1f} Hz in the mean' if batches else ''}"
     expected = f"{model.rate_hz:.1f} Hz, at which model {model.card.get('name', model.method)!r} was trained"
     fix = BATCHES if batches else "Choose or train a model for this sensor"
@@ -138,11 +140,11 @@ def bound(model: BiasModel, scalars: Mapping[str, Scalars], imu_topic: str, star
     if found is None:
         several = [name for name in scalars if is_temperature(name)]
         what = f"none of {', '.join(several)} is named as the IMU's temperature" if several else "there is no temperature"
-        out.remarks = (f"{what}; the model's bias follows it ({trained}), and varies unseen",)
+        out.remarks = (*model.remarks, f"{what}; the model's bias follows it ({trained}), and varies unseen")
         return _widened(out, *(model.tensors[f"temperature.{name}"] for name in ("spread", "walk")))
     name, channel = found
     out.log_drift = drift = TemperatureDrift(model, channel, name)
-    out.remarks = tuple(_remarks(channel, name, start_ns, end_ns, low, high))
+    out.remarks = (*model.remarks, *_remarks(channel, name, start_ns, end_ns, low, high))
     spread, walk = drift.beyond(start_ns, end_ns)
     return _widened(out, spread, walk) if spread.any() else out
 

@@ -122,12 +122,12 @@ class BiasModel(ABC):
     It computes in float64; files store float32. `tensors` are the weights and statistics by name, with the shapes of `shapes`;
     missing ones are zero. `log_drift` is the drift in the log that the model is bound to; its streams take samples without
     this drift. `remarks` lists the reasons for a larger uncertainty. `load_before` is the load on the sensor before the log, if
-    it was warm at the start (`imutool.bias_start.earlier_load`). `trained_hz` is set where `rate_hz` is not that of training.
+    it was warm at the start (`imutool.bias_start.earlier_load`).
     """
 
     method: ClassVar[str]
     card: Mapping[str, Any]
-    counts_samples, trained_hz = False, 0.0  # samples instead of seconds: it works at the rate of its training alone
+    counts_samples = False  # instead of seconds: it works at one rate alone
     log_drift: LogDrift | None = None
     remarks: tuple[str, ...] = ()
     load_before: Float64[np.ndarray, "3 11"] | None = None
@@ -143,7 +143,7 @@ class BiasModel(ABC):
 
     def at(self, rate_hz: float) -> Self:
         """Model for samples at another rate."""
-        (out := copy.copy(self)).trained_hz, out.rate_hz = self.trained_hz or self.rate_hz, rate_hz
+        (out := copy.copy(self)).rate_hz = rate_hz
         return out
 
     @classmethod

@@ -3,9 +3,8 @@
 x holds Legendre polynomials P of the temperature up to the third order, at once and behind lags, for the die lags what
 measures the case: dz/dt = (P(s) - z) / tau, s = (T - centre) / half range of training. Polynomials of the third order are what
 PX4 calibrates gyro and accelerometer with (PX4 user guide, thermal calibration). There s is clamped to the trained range; here
-P goes on straight beyond it.
-Relative to the mean of training the drift is no part of the prior of the rest bias, and zero is the best guess without a
-temperature.
+P goes on straight beyond it. Relative to the mean of training the drift is no part of the prior of the rest bias, and zero is
+the best guess without a temperature.
 
 The drift depends on the time alone: samples are corrected for it first, and a model then works on these as without it. A number
 of the channel holds until the next one, so that no sample depends on a later number.

@@ -241,7 +241,8 @@ class OnlineDebiaser:
             logger.warning(what, repeated, len(first))
             periods.append(float(t_ns[-1] - t_ns[0]) * 1e-9 / int(counts[:-1].sum()))
         rates = [1.0 / period_s for period_s in periods]
-        at_rate(self._model, min(rates, key=lambda hz: abs(hz - (self._model.rate_hz or hz))), "OnlineDebiaser")
+        rate_hz = min(rates, key=lambda hz: abs(hz - (self._model.rate_hz or hz)))
+        at_rate(self._model, rate_hz, "OnlineDebiaser")  # without `force` it is the same model, or refused
         if wrong := unusual_gravity(np.array([accel for _, accel in first])):
             logger.warning("OnlineDebiaser: %s", wrong)
 

@@ -33,9 +33,9 @@ from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias,
 from imutool.bias_start.prior_width import (
     MOST_CHANGE,
     MOST_DEVIATIONS,
-    MOST_LEFT,
     BiasPrior,
     contradicted_start,
+    most_left,
     supported_std,
     turned_axes,
     untold_bias,
@@ -99,7 +99,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     most = np.full(6, MOST_DEVIATIONS) if prior.least is None else MOST_OF_GUESS
     share = share_of_correction(none.innovations, unstarted.innovations)
     confirmed = HALF < share.value - SURE * share.std < MOST_SHARE
-    left = MOST_LEFT.get(len(model.card.get("sessions", ())), MOST_LEFT[0])
+    left = most_left(len(model.card.get("sessions", ())))
     other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean, left, confirmed=confirmed)
     other_bias, refuted = list(_other_bias(found, prior, most)), list(_refuted(share))
     contradictions = [*other_axes, *other_bias, *_disagreement(found, none), *refuted]
@@ -270,9 +270,8 @@ def _other_conditions(model: BiasModel, samples: Samples) -> list[str]:
     if ratio > MOST_NOISE:  # less noise is no doubt: a drone in the hand has a tenth of that in flight
         sentences.append(f"the samples are {ratio:.0f} times as noisy as in the training runs: another sensor, or vibration")
     rate_hz = 1.0 / float(quantile(np.diff(samples[0]), 0.5))
-    trained_hz = model.trained_hz or model.rate_hz
-    if trained_hz and abs(rate_hz / trained_hz - 1.0) > MOST_RATE:
-        sentences.append(f"samples at {rate_hz:.2f} Hz, in the training runs at {trained_hz:.2f} Hz")
+    if model.rate_hz and abs(rate_hz / model.rate_hz - 1.0) > MOST_RATE:
+        sentences.append(f"samples at {rate_hz:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
     return sentences
 
 

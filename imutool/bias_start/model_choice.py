@@ -153,7 +153,7 @@ def choose_model_and_start(
     return model, start if start.noise.any() else replace(start, noise=_noise(first_minute.imu))
 
 
-def bound_to(model: BiasModel, recording: Recording, where: str | Location = "", *, force: bool = True) -> BiasModel:
+def bound_to(model: BiasModel, recording: Recording, where: str | Location = "", *, force: bool = False) -> BiasModel:
     """Model at a recording's rate, with the drifts by its temperature and by the load before.
 
     Raises:

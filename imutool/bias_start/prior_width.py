@@ -24,9 +24,8 @@ LEAST_SHOWN = 0.2  # precision from the log, of that of the prior, below which t
 SAME_WIDTH = 1e-6  # share of a variance by which a narrower prior differs at least
 SHARES = np.linspace(0.0, 1.0, 25)[:, None]  # of the way from the least width of a prior to the most, in equal ratios
 TURNED = 20.0  # chi-square that turned axes leave at most, and by which they are better
-# Share of chi-square that turned axes leave at most, by known sessions: few say little of the next one. Of sensors that were
-# turned up to 0.16 (TUM-VI's, of one session, 0.11), by chance 0.28.
-MOST_LEFT = {0: 0.2, 1: 0.12, 2: 0.12, 3: 0.12}
+MOST_LEFT = 0.2  # share of chi-square that turned axes leave; of sensors that were turned up to 0.16, by chance 0.28
+FEW_SESSIONS, MOST_LEFT_OF_FEW = 3, 0.12  # few say little of the next one; TUM-VI's turned sensor, of one session, leaves 0.11
 CONTRADICTED = (np.inf, 10.8, 13.8, 16.3)  # chi-square of as many differences; a true prior exceeds it once in a thousand logs
 
 
@@ -114,6 +113,11 @@ def shown_bias(
     measured = precision > LEAST_SHOWN / before
     gain = np.where(measured, 1.0 - after / before, 1.0)
     return (bias - mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)
+
+
+def most_left(sessions: int) -> float:
+    """Share of chi-square that turned axes leave at most, by the known sessions."""
+    return MOST_LEFT_OF_FEW if 1 <= sessions <= FEW_SESSIONS else MOST_LEFT
 
 
 def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, most_left: float, *, confirmed: bool = False) -> list[str]:

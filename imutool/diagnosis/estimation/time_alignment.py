@@ -184,7 +184,7 @@ def _simulated(
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
     recorded = None if own_poses else recorded_at(real.imu, t_s, start_ns, even[:, :3])  # shares no errors of poses either
     clean, left = denoised(even, 1.0 / period_s, settings.alignment, recorded)
-    clean = even if copied else clean
+    clean = even if copied else clean  # what the filter takes would separate a recording from itself
     noise = np.minimum(noise, left.most)  # a vibration looks like white noise, and a recording shares it
     clean = refined(clean, *of_real)
     t_s = np.linspace(t_s[0], t_s[-1], len(clean))

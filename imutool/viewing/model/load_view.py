@@ -126,7 +126,7 @@ def _with_models(
     method = "smooth" if smooth else f"truth:{TRUTH_S:g}" if init == "truth" else init
     runs, aided, origins, about = list[Run](), list[Run](), {}, recording.metadata.get("imutool", {})
     wrong = [text for whole in warn_of_recordings([recording]) for text in contradictions(whole)]
-    for name, model, start in started(recording, models, init, log, smooth=smooth):
+    for name, model, start in started(recording, models, init, log, smooth=smooth, force=True):
         fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong)
         fit = fit.report(name, recording.name, force=True)
         notes += [] if fit.verdict == "fits" else [fit.sentence(f"The model {name}")]
