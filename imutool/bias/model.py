@@ -246,8 +246,7 @@ class _Stretches:
         """Bias at one sample."""
         if not 0.0 <= t_s - self._before_s <= GAP_S and not math.isnan(self._before_s):
             self._begin()
-        self._before_s = t_s
-        self._start_s = t_s if math.isnan(self._start_s) else self._start_s
+        self._before_s, self._start_s = t_s, t_s if math.isnan(self._start_s) else self._start_s
         bias: Vector6 = self._stream(np.array([t_s]), u[None, :3], u[None, 3:])[0] if self._one is None else self._one(t_s, u)
         return bias
 
@@ -282,6 +281,7 @@ class _Priors(msgspec.Struct):
     sessions: list[_Session] = []
     turn_on_least_std: tuple[float, float, float, float, float, float] | None = None
     speed: _Speed | None = None
+    turn_error: Annotated[float, msgspec.Meta(gt=0, le=1)] | None = None
 
 
 def check_card(card: Mapping[str, Any]) -> None:

@@ -186,7 +186,8 @@ def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
     walk = np.repeat(np.sqrt(np.mean(model.walk_std.reshape(2, 3) ** 2, axis=1)), 3)
     walk = np.where(walk > 0, walk, USUAL_WALK)
     least = None if start.least is None else start.least._replace(std=np.maximum(start.least.std, LEAST_STD))
-    settings = FilterSettings(**model.card.get("speed", {} if "logs" in model.card else UNKNOWN_BODY))
+    speed = model.card.get("speed", {} if "logs" in model.card else UNKNOWN_BODY)
+    settings = FilterSettings(gyro_scale=model.card.get("turn_error", FilterSettings().gyro_scale), **speed)
     return BiasPrior(start.rest, np.maximum(start.std, LEAST_STD), ground, walk, least, settings)
 
 
@@ -199,9 +200,7 @@ def tracked_from_prior(model: BiasModel, first_ns: int | None = None) -> Initial
 
 
 def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = "", first_ns: int | None = None) -> InitialBias:
-    """Smoothed rest bias in time from a whole log.
-
-    All stops, gravity in motion and the training runs.
+    """Smoothed rest bias in time from a whole log: all stops, gravity in motion and the training runs.
 
     `batches` are seconds since the first sample, gyro and accel; they are iterated again if the log contradicts the prior.
 

@@ -19,7 +19,7 @@ from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.networks.threads import of_each
 from imutool.bias_start.bias_at_rest import rest_differences
 from imutool.bias_start.bias_from_truth import LEAST_TRUTH_STD, TRUTH_S, bias_from_truth
-from imutool.bias_start.initial_bias import AT_REST_STD, SESSION_GAP_S, UNKNOWN_BODY
+from imutool.bias_start.initial_bias import AT_REST_STD, SESSION_GAP_S
 from imutool.bias_start.prior_width import USUAL_WALK
 from imutool.geometry import so3
 from imutool.inertial.stationary import white_noise
@@ -35,8 +35,6 @@ USUAL_STD = {"gyro": 5e-4, "accel": 2e-2}  # between logs of one switching-on
 MOST_TAIL, LEAST_FREEDOM = 3.0, 0.1  # variance of Student's t: three degrees of freedom, or fewer, count as three
 SESSION_STEP = {"gyro": 3e-3, "accel": 0.3}  # another switching-on: a larger step of the bias from one log to the next
 LEAST_TRUSTED, FEWEST_STARTS = 0.5, 4
-VEHICLE_M2_S = 1.0  # density of velocity above which the filter's usual bound is not believed
-SPEED_WINDOWS_S = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 WALKS, WALK_FACTOR = np.geomspace(0.01, 30.0, 24), 3.0  # multiples of the usual walk; deviation of the prior, as a factor
 WALK_WINDOW_S, MOST_WINDOWS, LEAST_COMBINATIONS, LEAST_SQUARE = 2.5, 24, 3, 1e-18
 LONGEST_WALK_WINDOW_S = {"gyro": 30.0, "accel": 5.0}  # a bias of the gyro tilts the accelerometer's windows
@@ -99,27 +97,6 @@ def store_statistics(
     stops = [np.where(shown, rows, 0.0) for rows in rest_differences(scored.frozen(), _samples(left), biases, velocities)]
     model.rest_std.copy_(torch.from_numpy(shift_at_rest(stops, std.cpu().double().numpy())))
     return turn_on
-
-
-def speed_of(pool: Pool) -> dict[str, Any]:
-    """Speed of the training logs for the model card, if they move as vehicles do.
-
-    The filter takes velocity for noise of the density 2 v^2 tau, with its correlation time tau, so its mean over a longer time
-    T has the variance 2 v^2 tau / T. The largest density over all T counts. Poses without positions show no speed.
-    """
-    if "accel" not in pool.sensors:
-        return {"speed": UNKNOWN_BODY}
-    densities = []
-    for window_s in SPEED_WINDOWS_S:
-        n = pool.samples(window_s)
-        first = pool.starts(n, "all", hop=n)
-        moved = (pool.p_wb[first + n] - pool.p_wb[first]).square().mean(1) / window_s
-        of_log = [float(moved[pool.log[first] == log].mean()) for log in set(pool.log[first].tolist())]
-        densities.append(float(np.mean(of_log or [0.0])))
-    square, density = float(pool.v_w[pool.trusted].square().mean()), max(densities)
-    if density <= VEHICLE_M2_S:
-        return {}
-    return {"speed": {"speed_m_s": math.sqrt(square), "speed_correlation_s": density / (2.0 * square)}}
 
 
 def turn_on_prior(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[int, int]]) -> TurnOn:

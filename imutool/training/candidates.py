@@ -18,13 +18,14 @@ from imutool.bias.networks import hybrid, static
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.temperature import temperature_tensors
 from imutool.bias.temperature import Scale
-from imutool.training.bias_spread import speed_of, store_statistics, turn_on_prior
+from imutool.training.bias_spread import store_statistics, turn_on_prior
 from imutool.training.calibration.effect_selection import (
     LINEAR,
     Calibration,
     effects_beyond_chance,
     parameter_columns,
 )
+from imutool.training.calibration.filter_settings import filter_settings
 from imutool.training.calibration.log_scatter import LEAST_GAIN
 from imutool.training.calibration.shared_parameters import gain_of
 from imutool.training.log_signals import effects_turned_alike
@@ -112,7 +113,7 @@ def left_out_model(
     network.prior_mean.copy_(torch.from_numpy(turn_on.mean))
     network.prior_std.copy_(torch.from_numpy(turn_on.std))
     model = network.frozen()
-    model.card = {"logs": [{}] * (len(spans) - 1), **turn_on.card(), **speed_of(pool)}
+    model.card = {"logs": [{}] * (len(spans) - 1), **turn_on.card(), **filter_settings(model, pool)}
     return model
 
 

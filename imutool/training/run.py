@@ -28,8 +28,8 @@ from imutool.log_info.convention_report import check_conventions
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.training import checkpoint
-from imutool.training.bias_spread import speed_of
 from imutool.training.calibration.effect_selection import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
+from imutool.training.calibration.filter_settings import filter_settings
 from imutool.training.calibration.log_scatter import LEAST_GAIN, SURELY
 from imutool.training.candidates import left_out_covariance, simpler_effects
 from imutool.training.fit import Epoch, Training, check_device, note
@@ -106,9 +106,8 @@ def train(
     trainer: Trainer = TRAINERS[method] if method in TRAINERS else partial(_network_alone, method)
     with side_by_side():
         model, about = trainer(recordings, chosen, descent)
-    model.card = (
-        _card(method, chosen, parts) | about | speed_of(pool) | {key: _shared(recordings, key) for key in ("sensor", "dataset")}
-    )
+    about |= filter_settings(model.frozen(), pool)
+    model.card = _card(method, chosen, parts) | about | {key: _shared(recordings, key) for key in ("sensor", "dataset")}
     model_file.save(model.frozen(), out, overwrite=overwrite)
     kept.unlink(missing_ok=True)
     return model_file.load(out)

@@ -38,8 +38,10 @@ from imutool.inertial.strapdown import along_truth
 from imutool.recording import Imu, Poses, Recording, nanoseconds
 from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.calibration.effect_selection import PhysicsFirst
+from imutool.training.calibration.filter_settings import filter_settings
 from imutool.training.fit import Training
 from imutool.training.settings import settings_of
+from imutool.training.training_windows import Pool
 from imutool.units import SENSORS
 
 MINUTE_S, SCORED, DRAWS = 60.0, ("truth", "auto", "smooth"), 5
@@ -118,7 +120,8 @@ def learned(recordings: list[Recording], words: list[str]) -> BiasModel:
     for _ in training.epochs():
         pass
     model = physics.finish(training.model)
-    model.card = {"logs": [r.name for r in recordings], **training.turn_on.card()}
+    pool = Pool.of(recordings, floors=settings.pose_floors)
+    model.card = {"logs": [r.name for r in recordings], **training.turn_on.card(), **filter_settings(model.frozen(), pool)}
     return model.frozen()
 
 

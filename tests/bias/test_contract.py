@@ -321,6 +321,7 @@ def test_numbers_that_are_not_finite_are_refused(model: BiasModel, saved: Path, 
         {"card": '{"turn_on_least_std": "NaN"}'},
         {"card": '{"turn_on_least_std": [NaN, 0, 0, 0, 0, 0]}'},
         {"card": '{"speed": {"speed_m_s": 0, "speed_correlation_s": 1}}'},
+        {"card": '{"turn_error": 2}'},
     ],
     ids=lambda header: "-".join(f"{k}={str(v)[:20]}" for k, v in header.items()),
 )

@@ -6,19 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from support.switchings_on import Switchings, log
 
 from imutool.bias import static
 from imutool.bias_start.bias_at_rest import rest_differences
-from imutool.bias_start.initial_bias import AT_REST_STD, UNKNOWN_BODY
+from imutool.bias_start.initial_bias import AT_REST_STD
 from imutool.bias_start.prior_width import USUAL_WALK
 from imutool.mcap_io.write import write
-from imutool.recording import Imu, Poses, Recording
-from imutool.training.bias_spread import MOST_TAIL, TURN_ON_STD, USUAL_STD, shift_at_rest, speed_of, turn_on_prior
+from imutool.training.bias_spread import MOST_TAIL, TURN_ON_STD, USUAL_STD, shift_at_rest, turn_on_prior
 from imutool.training.run import train
 from imutool.training.settings import TrainSettings
-from imutool.training.training_windows import Pool
 
 HOUR_NS = 3600 * 10**9
 USUAL = np.array([USUAL_STD["gyro"]] * 3 + [USUAL_STD["accel"]] * 3)
@@ -101,23 +98,6 @@ def test_a_steady_drive_is_no_stop() -> None:
     np.testing.assert_allclose(stops[:, 2], 0.0, atol=2e-4)
     assert len(stops) == 1
     assert np.abs(driven[:, 2]).max() > 2e-3
-
-
-def test_logs_of_a_vehicle_widen_the_bound_on_speed() -> None:
-    """Fifteen metres a second on a circle that takes 20 s, and the same path a hundred times smaller."""
-    t_s, rate = np.arange(0.0, 100.0, 0.05), 2 * np.pi / 20.0
-    heading = Rotation.from_rotvec(np.outer(rate * t_s, [0.0, 0.0, 1.0])).as_quat(scalar_first=True)
-    t_ns, speeds = np.round(1e9 * t_s).astype(np.int64), {}
-    imu = Imu(t_ns, np.tile([0.0, 0.0, rate], (len(t_s), 1)), np.tile([0.0, 15.0 * rate, 9.81], (len(t_s), 1)))
-    for speed in (0.15, 15.0):
-        p_wb = speed / rate * np.stack([np.sin(rate * t_s), 1.0 - np.cos(rate * t_s), 0.0 * t_s], axis=1)
-        speeds[speed] = speed_of(Pool.of([Recording("circle", imu, {"/pose": Poses(t_ns, p_wb, heading)})]))
-    assert speeds[0.15] == {}
-    turned_alone = {"/pose": Poses(t_ns, np.zeros((len(t_s), 3)), heading)}
-    assert speed_of(Pool.of([Recording("circle", imu, turned_alone)]))["speed"] == UNKNOWN_BODY, "poses without positions"
-    found = speeds[15.0]["speed"]
-    np.testing.assert_allclose(found["speed_m_s"], 15.0 / np.sqrt(3.0), rtol=0.02)
-    assert 1.0 < found["speed_correlation_s"] < 20.0
 
 
 @pytest.mark.parametrize(
