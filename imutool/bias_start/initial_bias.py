@@ -200,7 +200,7 @@ def tracked_from_prior(model: BiasModel, first_ns: int | None = None) -> Initial
 
 
 def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = "", first_ns: int | None = None) -> InitialBias:
-    """Smoothed rest bias in time from a whole log: all stops, gravity in motion and the training runs.
+    """Smoothed rest bias in time, by all stops, gravity in motion and the training runs.
 
     `batches` are seconds since the first sample, gyro and accel; they are iterated again if the log contradicts the prior.
 

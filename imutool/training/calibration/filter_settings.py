@@ -1,4 +1,4 @@
-"""Settings of the bias filter that the training logs show: the speed of the body, and the error of a turn."""
+"""Bias filter settings from training logs: speed of the body, error of a turn."""
 
 from __future__ import annotations
 
