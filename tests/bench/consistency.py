@@ -222,7 +222,8 @@ def told(logs: list[Judgement]) -> str:
     found = consistency(error, bias + other)
     bounds = f"95 % bounds {found['nees_lower']:.2f} to {found['nees_upper']:.2f}"
     covered = coverage(np.concatenate([log.squares() for log in logs]))
-    return f"NEES {found['nees_mean']:6.2f}  {bounds}  windows {found['samples']:3.0f}  coverage {covered}"
+    rms = np.sqrt((error**2).sum(axis=1).mean())
+    return f"NEES {found['nees_mean']:6.2f}  {bounds}  windows {found['samples']:3.0f}  coverage {covered}  rms {rms:.2e}"
 
 
 if __name__ == "__main__":

@@ -56,6 +56,7 @@ def main() -> None:
     parser.add_argument("--start", action="append")
     parser.add_argument("--minute", action="store_true")
     parser.add_argument("--switched-on-again", action="store_true", help="the log left out gets another turn-on bias")
+    parser.add_argument("--turn-error", type=float, help="share of a turn, in place of the calibration's own")
     options = parser.parse_args()
     starts = options.start or list(STARTS)
     logs = recordings(options.logs)
@@ -66,6 +67,8 @@ def main() -> None:
     table, rng = [], np.random.default_rng(5)
     for left_out in logs:
         model = learned([r for r in logs if r is not left_out], options.set)
+        if options.turn_error:
+            model.card["turn_error"] = options.turn_error
         scored = replace(left_out, imu=moved(left_out.imu, rng)) if options.switched_on_again else left_out
         table.append([aoe(model, scored, start) for start in starts])
         found = ", ".join((*(model.config.gyro_effects or ()), *(model.config.accel_effects or ())))
