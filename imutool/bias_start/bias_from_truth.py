@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Bool, Float64, Int64
 from imutool.bias.model import COLUMNS, Array, BiasModel, Vector6
 from imutool.bias_start.initial_bias import (
     LEAST_STD,
@@ -87,7 +87,7 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
         if known[at].sum() > 1
     ]
     usual = model.truth_std**2 * (TRUTH_S / length_s) ** 2
-    variance = _variance(usual, thirds)
+    variance = _variance(usual, thirds, _by_calibration(model, piece, parts[1:]))
     if not truth.has_positions:
         offset[3:], variance[3:] = 0.0, NOT_SEEN**2
     start = replace(start, std=supported_std(start.std, start.least, offset, variance + WORLD_TILT_STD**2))
@@ -104,18 +104,27 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     return InitialBias(rest, std, f"{how}, then {TRACKED_BY}", follows=before, hold_s=float(ends_s))
 
 
-def _variance(usual: Vector6, thirds: Sequence[Vector6]) -> Vector6:
+def _by_calibration(model: BiasModel, piece: Imu, thirds: Sequence[Int64[np.ndarray, " _"]]) -> Vector6:
+    """Variance, from third to third, of what the calibration does not know of the motion."""
+    out, root_at = np.zeros(6), model.calibration_covariance()
+    for sensor, S in {} if root_at is None else root_at(*relative_samples(piece)).items():
+        out[COLUMNS[sensor]] = np.var([S[at].mean(axis=0) for at in thirds], axis=0, ddof=1).sum(axis=1)
+    return out
+
+
+def _variance(usual: Vector6, thirds: Sequence[Vector6], by_calibration: Vector6) -> Vector6:
     """Variance of an offset: the usual one, or if those of thirds of the poses contradict it, what these show.
 
     Poses of a log may be worse than those of the training logs: markers are exchanged, a clock wanders. The usual variance of a
     third is 9 (errors that last) to 27 times (white ones) as large. Errors that contradict it are taken to last even longer:
-    the variance of the whole is a third of what the thirds show.
+    the variance of the whole is a third of what the thirds show. `by_calibration` is what another motion in each third may do.
     """
     variance = usual.copy()
     if len(thirds) == PARTS:
-        shown, least = np.var(thirds, axis=0, ddof=1), np.maximum(usual, LEAST_TRUTH_STD**2) + WORLD_TILT_STD**2
+        least = PARTS**2.5 * (np.maximum(usual, LEAST_TRUTH_STD**2) + WORLD_TILT_STD**2) + by_calibration
+        shown = np.var(thirds, axis=0, ddof=1)
         for axes in COLUMNS.values():
-            if (PARTS - 1) * (shown[axes] / least[axes]).sum() / PARTS**2.5 > CONTRADICTED:
+            if (PARTS - 1) * (shown[axes] / least[axes]).sum() > CONTRADICTED:
                 variance[axes] = np.maximum(usual[axes], np.maximum(shown[axes], shown[axes].mean()) / PARTS)
     return variance
 
