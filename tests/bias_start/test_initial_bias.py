@@ -297,7 +297,7 @@ def test_poses_whose_parts_disagree_are_trusted_less(biased: Recording) -> None:
 
 @pytest.mark.parametrize("scale_std", [1e-3, 0.05])
 def test_a_scale_that_the_model_does_not_know_is_no_fault_of_the_poses(biased: Recording, scale_std: float) -> None:
-    """A model of a minute that turned one way: each third of a start turns otherwise, and the poses were trusted less for it."""
+    """A model of a minute that turned one way: each third of a start turns otherwise, and the poses had the blame."""
     tensors = {"prior_std": np.full(6, 0.03), "truth_std": np.full(6, 1e-4), "covariance.gyro": scale_std**2 * np.eye(9)}
     fitted = linear.Model(linear.Config(covariance=True), RATE_HZ, tensors)
     imu = replace(biased.imu, gyro=1.04 * biased.imu.gyro)
