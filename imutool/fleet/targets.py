@@ -17,7 +17,7 @@ from imutool.mcap_io.storage.source import sha256
 
 LONGEST = 200  # bytes of one part of a name: room for what is written beside it under another, within the usual 255
 PARTIAL = re.compile(r"\.(?P<name>.+)\.\d+\.[0-9a-f]{8,24}\.partial", re.DOTALL)
-LARGEST_HASHED = 1 << 20  # bytes of a log: SHA-256 takes half a millisecond for so many, a digest with CRCs less
+LARGEST_HASHED = 4 << 20  # bytes of a log: SHA-256 takes two milliseconds for so many, a digest with CRCs a tenth of one
 OWN = "fleet."  # how the names of what the fleet itself writes at the top of OUT begin
 
 
