@@ -169,7 +169,7 @@ def _stepped(
     best = [_best(coarse, column) for column in slowly.T]
     own = np.where(slowly.max(axis=0) < LEAST_CORRELATION, np.nan, coarse[best])[1:]
     parts = np.full(DELAY_PARTS, np.nan)
-    for centre in np.unique(own[np.isfinite(own)]):
+    for centre in {*own[np.isfinite(own)].tolist()}:  # np.unique imports numpy.ma, a sixteenth of `info`
         fine = fast.correlations(centre + FINE_LAGS_S, DELAY_PARTS)[:, 1:]
         for row in np.flatnonzero(own == centre):
             parts[row] = _peak(centre + FINE_LAGS_S, fine[:, row])

@@ -114,7 +114,7 @@ def _schema(pa: Any) -> Any:
         "source_bytes": whole,
         "target_bytes": whole,
         "target_sha256": text,
-        "target_digest": text,  # of a log above 64 MiB, in place of it
+        "target_digest": text,  # of a log above 4 MiB, in place of it
         "messages": whole,
         "duration_s": real,
         "biases": pa.list_(pa.struct([("topic", text), ("gyro_rad_s", three), ("accel_m_s2", three)])),

@@ -20,13 +20,13 @@ from imutool.bag.repair import repair_bag
 from imutool.cleaning import CleaningSettings
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError
+from imutool.fleet import targets
 from imutool.fleet.one_log import COMMANDS, work
 from imutool.fleet.robots import robot_of, robot_pattern
 from imutool.fleet.sources import find
 from imutool.fleet.targets import is_current, page_name, target_name
 from imutool.fleet.task import Result, Settings, Source, Task, with_model_hash
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.passthrough import source_digest
 from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.write import write
@@ -152,7 +152,7 @@ def test_a_flipped_byte_is_seen_when_all_is_read_again(done: Result, logs: Path,
 def test_every_flipped_byte_of_a_large_log_is_seen_by_its_digest(
     logs: Path, tmp_path: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(source_digest, "LARGEST_HASHED", 1000)
+    monkeypatch.setattr(targets, "LARGEST_HASHED", 1000)
     done = work(task(logs / "flight_1.mcap", tmp_path / "out", settings))
     assert (done.target_sha256, len(done.target_digest)) == ("", 64)
     again = work(task(logs / "flight_1.mcap", tmp_path / "out", settings, done=done, recheck=True))
