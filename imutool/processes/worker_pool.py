@@ -51,7 +51,7 @@ Tick = Callable[[int], None]
 
 
 class WorkerDiedError(Exception):
-    """Error of an item whose worker died, and each one after it; `overdue` if it was ended at the time limit."""
+    """Error of an item whose worker died, also when tried again, or was ended as `overdue`."""
 
     def __init__(self, code: int, *, overdue: bool = False) -> None:
         super().__init__(signal.strsignal(-code) if code < 0 else f"exit code {code}")

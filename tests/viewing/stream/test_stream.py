@@ -370,7 +370,9 @@ def test_the_command_replays_a_log_and_reports_the_delay(logs: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_standard_input_is_printed_debiased_until_ctrl_c(imu: Imu, tmp_path: Path, command: str, number: signal.Signals) -> None:
+def test_standard_input_is_printed_debiased_until_ctrl_c(
+    imu: Imu, tmp_path: Path, command: str, number: signal.Signals
+) -> None:
     line = [command, "live", "--from", "stdin", "--no-view", "--print", "--json", str(tmp_path / "r.json")]
     with subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdin is not None
