@@ -109,7 +109,7 @@ def simulate(
 
 
 @app.command(
-    epilog="Example: [bold]imutool conceal MH_03.mcap case/ --seed 7[/]; after the diagnosis [bold]imutool conceal --open case/[/]"
+    epilog="Example: [bold]imutool conceal MH_03.mcap case/ --seed 7[/]; once diagnosed [bold]imutool conceal --open case/[/]"
 )
 def conceal(
     places: Annotated[list[Path], typer.Argument(metavar="[TRAJECTORY] DIR", help="A log with true poses; the case's folder.")],
