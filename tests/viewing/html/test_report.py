@@ -124,7 +124,11 @@ def test_a_model_that_does_harm_is_not_praised(seen: RunData) -> None:
     said = report_wording.comparison(worse, raw)
     assert said.startswith("half raises the orientation error from")
     assert "(2.0 times) and leaves the position error about as it was" in said
-    assert report_wording.summary_of_logs([replace(seen, traces=(raw, worse))]).startswith("In 0 of 1 logs")
+    seen = replace(seen, traces=(raw, worse))
+    assert report_wording.summary_of_logs([seen]).startswith("In 0 of 1 logs")
+    with drawing_only():
+        compared = re.findall(r"<td class=word>(.*?)</td>.*?(best)?\" title", report.page([seen, replace(seen, name="other")]))
+    assert [best for _, best in compared] == ["best", "", "best", ""]  # the smallest error, here of raw
 
 
 def test_every_figure_is_in_the_table_to_the_last_digit_and_the_best_is_marked(seen: RunData, page: str) -> None:
