@@ -151,7 +151,8 @@ def over_all_rest(model: BiasModel, blocks: Blocks) -> InitialBias:
 def _calm(blocks: Blocks, ranges: Sequence[tuple[int, int]]) -> Sequence[tuple[int, int]]:
     """Parts of ranges at rest whose seconds shake little more than the calmest; all where none does by both sensors."""
     block_s, calm = blocks.k * blocks.period_s, np.zeros(len(blocks.late), bool)
-    pieces = [piece for a, b in ranges for piece in np.array_split(np.arange(a, b), max(1, round((b - a) * block_s)))]
+    counts = [min(b - a, max(1, round((b - a) * block_s))) for a, b in ranges]  # at 1 Hz a block has two seconds
+    pieces = [piece for (a, b), n in zip(ranges, counts, strict=True) for piece in np.array_split(np.arange(a, b), n)]
     noise = np.sqrt([blocks.var[piece].mean(axis=0).reshape(2, 3).sum(axis=1) for piece in pieces]).reshape(-1, 2)
     for piece in itertools.compress(pieces, (noise <= MOST_SHAKING * noise.min(axis=0, initial=np.inf)).all(axis=1)):
         calm[piece] = True

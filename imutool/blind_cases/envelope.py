@@ -184,7 +184,8 @@ def _text(path: Path) -> str:
             raise DataError(f"{path.stat().st_size} bytes", where=path, expected=f"at most {LARGEST}")
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot be read ({error})", where=path, expected="a file of the blind case") from error
+        why = error.strerror if isinstance(error, OSError) else error
+        raise DataError(f"cannot be read ({why})", where=path, expected="a file of the blind case") from error
 
 
 def _xor(data: bytes, key: bytes) -> bytes:

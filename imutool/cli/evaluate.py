@@ -123,7 +123,9 @@ def evaluate(
             if report is not None:
                 scored = [name for name in model or () if name not in refused]
                 run_data = load(log, models=scored, aid=asked, **read)
-                loaded.append(replace(run_data, notes=(*run_data.notes, *_late(results[first:]), *_fits(results[first:]))))
+                loaded.append(
+                    replace(run_data, notes=(*run_data.notes, *_late(results[first:])))
+                )  # it judges the models itself
         if report is not None:
             tell(len(logs), len(logs), "drawing")
             pages.write_page(loaded, report, overwrite=common.overwrite)

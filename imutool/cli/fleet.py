@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable
+from math import inf
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -32,6 +33,7 @@ FOLDER, PAGE = Written(files=(), keeps=True), Written(output_conflicts.HTML, kee
 UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 SHOWN = 10  # logs that are not whole; all are in fleet.parquet
 PAGES_HELP = "Also write a page for each log, with a link from --report; it takes 5 to 10 s for a log of minutes."
+TIME_LIMIT_HELP = "Longest time for one log; then it fails, and the others go on. Without --address."
 RESUME = "Continue an earlier run: skip finished logs."
 Imus = Annotated[
     list[str] | None,
@@ -54,6 +56,7 @@ def _run(
     workers: Annotated[int | None, typer.Option(min=1, help="Number of logs at once; by default one per core.")] = None,
     memory: Annotated[str, typer.Option("--memory-per-task", metavar="SIZE", help="Memory for each log: 800M, 2G.")] = "1G",
     retries: Annotated[int, typer.Option(min=0, help="Number of retries after a worker died.")] = 3,
+    time_limit: Annotated[float, typer.Option(min=1.0, metavar="SECONDS", help=TIME_LIMIT_HELP, show_default=False)] = inf,
     common: Common = COMMON,
 ) -> None:
     """Run a command; its parameters but the settings are options of every fleet command."""
@@ -62,13 +65,15 @@ def _run(
     from imutool.fleet.run import run
 
     limits: dict[str, Any] = {"workers": workers, "memory_bytes": memory_bytes(memory), "retries": retries}
+    if time_limit < inf and address is not None:
+        raise ConfigError("a cluster's workers have no time limit", where="--time-limit", fix="Leave out --address, or this")
     page = None if report is None else to_location(report)
     with common.progress(f"Fleet {settings.command}") as tell:
         done = run(
             source,
             target,
             settings,
-            lambda: ProcessEngine(**limits) if address is None else RayEngine(address, **limits),
+            lambda: ProcessEngine(**limits, limit_s=time_limit) if address is None else RayEngine(address, **limits),
             resume=resume,
             overwrite=common.overwrite,
             recheck=recheck,

@@ -10,7 +10,7 @@ import typer
 
 from imutool.cli.app import COMMON, LOG, Common, Json, Quiet, Truth, Verbose, app
 from imutool.cli.terminal import log_to_stderr, logger, say, write_json
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
 from imutool.report import Report, Section
 
 
@@ -108,7 +108,9 @@ def simulate(
     say(f"uncertainty of the motion {std}; {motion.glitches} outliers and {motion.steps} jumps of the poses removed")
 
 
-@app.command(epilog="Example: [bold]imutool conceal MH_03.mcap case/ --seed 7[/], then [bold]imutool conceal --open case/[/]")
+@app.command(
+    epilog="Example: [bold]imutool conceal MH_03.mcap case/ --seed 7[/]; once diagnosed [bold]imutool conceal --open case/[/]"
+)
 def conceal(
     places: Annotated[list[Path], typer.Argument(metavar="[TRAJECTORY] DIR", help="A log with true poses; the case's folder.")],
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the case; by default random.")] = None,
@@ -157,6 +159,9 @@ def _open(folder: Path, findings: Path | None, json_to: str | None, overwrite: b
 
     from imutool.blind_cases import open_case
 
+    if findings is None and (folder / "sim.mcap").exists() and not (folder / "findings.json").exists():
+        fix = f"Run imutool diagnose {folder}/real.mcap --sim {folder}/sim.mcap -o {folder}"
+        raise DataError("holds no findings.json to score", where=folder, expected="a case after its diagnosis", fix=fix)
     result: dict[str, Any] = msgspec.to_builtins(open_case(folder, findings))
     if write_json(result, json_to, overwrite=overwrite):
         return

@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from imutool import registry
+from imutool.config import toml
 from imutool.conversion import Failure
 from imutool.conversion.common_setup import most_alike, shared
 from imutool.conversion.correction_rounds import write_corrected
@@ -226,11 +227,22 @@ def check_targets(jobs: Sequence[Job], source: Path) -> None:
         if (other := jobs_by_target.setdefault(job.target, job)) is not job:
             what = f"two sequences are named {job.sequence.name}: {other.sequence} and {job.sequence}"
             raise ConfigError(what, where="source", fix="Convert them one at a time")
-        sources = getattr(job.sequence, "path", None), source if source.is_file() else None
+        sources = getattr(job.sequence, "path", None), source if source.is_file() else None, *_stated_files(job)
         if any(path is not None and _is_part_of(job.target, path) for path in sources):
             raise ConfigError("is the source itself", where=job.target, expected="another `out`")
         if job.target.exists() and not job.overwrite:
             raise ConfigError("exists", where=job.target, fix="Choose another `out`, or add `overwrite`")
+
+
+def _stated_files(job: Job) -> list[Path]:
+    """Map of a job, and the table of true poses that it names; they are read only where a log may replace them."""
+    if job.mapping is None or not job.target.exists():
+        return []
+    own = [job.mapping] if isinstance(job.mapping, Path) else []
+    entries = toml(job.mapping, "map of a table") if isinstance(job.mapping, Path) else job.mapping
+    place = getattr(job.sequence, "path", job.target)
+    poses = (place if place.is_dir() else place.parent) / str(entries.get("truth_file", ""))
+    return [path for path in (*own, poses) if path.is_file()]
 
 
 def _is_part_of(target: Path, source: Path) -> bool:

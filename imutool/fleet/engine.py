@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import signal
 import socket
@@ -54,15 +55,19 @@ class Engine(Protocol):
 class ProcessEngine:
     """Processes of this machine: at most `workers`, and no more than memory allows.
 
+    A log that takes longer than `limit_s` fails.
+
     Raises:
         ConfigError: the machine does not have that much memory.
     """
 
-    def __init__(self, *, workers: int | None = None, memory_bytes: int = 1 << 30, retries: int = 3) -> None:
+    def __init__(
+        self, *, workers: int | None = None, memory_bytes: int = 1 << 30, retries: int = 3, limit_s: float = math.inf
+    ) -> None:
         memory = system.memory_bytes()
         _refuse_too_much(memory_bytes, memory)
         self.workers = max(1, min(workers or system.processors(), memory // max(memory_bytes, 1)))
-        self._retries = retries
+        self._retries, self._limit_s = retries, limit_s
 
     def __enter__(self) -> ProcessEngine:
         return self
@@ -72,12 +77,16 @@ class ProcessEngine:
 
     def run(self, tasks: Iterable[Task], tick: Tick = lambda running: None, model: bytes | None = None) -> Generator[Result]:
         """Yield results as tasks end; a ConfigError says that processes do not start."""
-        with WorkerPool(partial(_work_quietly, model=model), self.workers, retries=self._retries) as pool:
+        quietly = partial(_work_quietly, model=model)
+        with WorkerPool(quietly, self.workers, retries=self._retries, limit_s=self._limit_s) as pool:
             for outcome in pool.run(tasks, tick):
                 if outcome.error is None:
                     yield outcome.value
                 elif isinstance(outcome.error, WorkerBugError):
                     yield _bug(outcome.item, outcome.error, outcome.error.trace)
+                elif outcome.error.overdue:
+                    why = f"it took longer than {self._limit_s:g} s. Set a longer time limit, or look at this log by itself."
+                    yield failed(outcome.item.key, outcome.item.source, why, LogError.exit_code, outcome.item.target)
                 else:
                     yield _died(outcome.item, str(outcome.error))
 

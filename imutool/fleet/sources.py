@@ -30,6 +30,7 @@ from imutool.file_location import (
     size_and_etag,
     to_location,
 )
+from imutool.fleet.journal import NAME as JOURNAL
 from imutool.fleet.targets import relative, shown
 from imutool.fleet.task import Source
 
@@ -103,6 +104,9 @@ def find(text: str, out: Location, *, bags: bool = False, once: bool = False) ->
     if not logs and not refused:
         expected = "a log, a folder with logs, or a pattern that fits some"
         raise ConfigError(f"no {' or '.join(endings)} log", where=text, expected=expected, fix=CONVERT if passed_over else "")
+    if outputs and not exists(out / JOURNAL):  # they are no results of a fleet
+        told = redact(text), outputs, redact(str(out))
+        logger.warning("%s: of its logs %d are left out, for they lie below OUT (%s); choose an OUT beside the logs", *told)
     if passed_over:
         kinds = ", ".join(f"{count} {ending}" for ending, count in passed_over.items())
         logger.warning("%s: files that are no MCAP logs are passed over (%s); %s", redact(text), kinds, CONVERT)

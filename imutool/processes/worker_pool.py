@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import json
+import math
 import os
 import pickle
 import queue
@@ -50,10 +51,11 @@ Tick = Callable[[int], None]
 
 
 class WorkerDiedError(Exception):
-    """Error of an item whose worker died, and each one after it."""
+    """Error of an item whose worker died, also when tried again, or was ended as `overdue`."""
 
-    def __init__(self, code: int) -> None:
+    def __init__(self, code: int, *, overdue: bool = False) -> None:
         super().__init__(signal.strsignal(-code) if code < 0 else f"exit code {code}")
+        self.overdue = overdue
 
 
 class WorkerBugError(Exception):
@@ -80,6 +82,7 @@ class _Item:
     value: Any
     deaths: int = 0
     shared: bool = False  # whether other items ran at the same time
+    overdue: bool = False
 
 
 @dataclass(eq=False)
@@ -88,17 +91,18 @@ class _Worker:
     connection: Connection
     ready: bool = False
     item: _Item | None = None
+    until: float = math.inf
 
 
 class WorkerPool:
     """Pool of processes that apply a function, as a context manager.
 
     `function` is pickled once for each worker, so it is a function of a module, or a partial one. Workers start when items wait
-    for them, at most `workers`. An item whose worker dies is tried again, up to `retries` times.
+    for them, at most `workers`. An item is tried again up to `retries` times if its worker dies, and given up after `limit_s`.
     """
 
-    def __init__(self, function: Callable[[Any], Any], workers: int, *, retries: int = 0) -> None:
-        self._function, self._limit, self._retries = pickle.dumps(function), workers, retries
+    def __init__(self, function: Callable[[Any], Any], workers: int, *, retries: int = 0, limit_s: float = math.inf) -> None:
+        self._function, self._limit, self._retries, self._limit_s = pickle.dumps(function), workers, retries, limit_s
         self._workers: list[_Worker] = []
         self._again: deque[_Item] = deque()  # after a crash of their own
         self._alone: deque[_Item] = deque()  # after a kill while others ran
@@ -129,6 +133,7 @@ class WorkerPool:
                     outcome = self._receive(worker)
                     if outcome is not None:
                         yield outcome
+                self._stop_overdue()
         finally:
             self.close()
 
@@ -137,10 +142,7 @@ class WorkerPool:
         ending, self._workers = self._workers, []
         for worker in ending:
             worker.connection.close()
-            if worker.item is None:
-                worker.process.kill()
-            else:
-                worker.process.terminate()
+            (worker.process.kill if worker.item is None else worker.process.terminate)()
         until = time.monotonic() + GRACE_S
         for worker in ending:
             try:
@@ -155,7 +157,7 @@ class WorkerPool:
         given: list[tuple[_Worker, _Item]] = []
         while self._busy < self._limit and (item := self._next(waiting)) is not None:
             worker = next((worker for worker in self._workers if worker.item is None), None) or self._start()
-            worker.item = item
+            worker.item, worker.until = item, time.monotonic() + self._limit_s
             given.append((worker, item))
         shared = self._busy > 1
         for worker in self._workers:
@@ -207,13 +209,20 @@ class WorkerPool:
         except (EOFError, OSError):
             return self._died(worker)
         if raw == READY:
-            worker.ready, self._failed_starts = True, 0
+            worker.ready, self._failed_starts, worker.until = True, 0, time.monotonic() + self._limit_s
             return None
         item, worker.item = worker.item, None
         assert item is not None, "only a busy worker answers"
         value = pickle.loads(raw)  # noqa: S301  from our own process
         error = value if isinstance(value, WorkerBugError) else None
         return Outcome(item.value, None if error else value, error)
+
+    def _stop_overdue(self) -> None:
+        """End workers whose item takes too long: at first they may remove what they have half written."""
+        for worker in self._workers:
+            if worker.item is not None and time.monotonic() > worker.until:
+                (worker.process.kill if worker.item.overdue else worker.process.terminate)()
+                worker.item.overdue, worker.until = True, time.monotonic() + GRACE_S
 
     def _died(self, worker: _Worker) -> Outcome | None:
         self._workers.remove(worker)
@@ -225,6 +234,8 @@ class WorkerPool:
             code = worker.process.wait()
         item = worker.item
         assert item is not None, "only busy workers are waited for"
+        if item.overdue:
+            return Outcome(item.value, None, WorkerDiedError(code, overdue=True))
         if not worker.ready:
             self._failed_starts += 1
             if self._failed_starts >= STARTS:

@@ -144,6 +144,15 @@ def test_a_bias_at_rest_is_that_of_the_calm_stops() -> None:
     assert start.how.startswith("6.")
 
 
+def test_at_one_sample_a_second_the_calm_is_found_too() -> None:
+    """Its blocks of two samples are longer than the seconds that are compared: some had no block, and were warned of."""
+    accel = np.tile([0.0, 0.0, GRAVITY_M_S2], (120, 1))
+    gyro = np.full((120, 3), 0.01) + 1e-4 * np.random.default_rng(0).standard_normal((120, 3))
+    gyro[80:] += 0.02 * (-1.0) ** np.arange(40)[:, None] + 0.005
+    start = over_all_rest(static.Model(), blocks_of(Imu(10**9 * np.arange(120), gyro, accel)))
+    np.testing.assert_allclose(start.rest[:3], 0.01, atol=1e-4)
+
+
 def test_a_models_own_part_is_taken_off_first() -> None:
     """At rest the accelerometer's matrix sees gravity: W f is no turn-on bias."""
     imu, _ = resting()

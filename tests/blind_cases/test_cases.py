@@ -602,6 +602,9 @@ def test_the_command_conceals_and_opens(
     done = imutool("conceal", trajectory, "case", "--seed", "4", "--kind", "null", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "sim.mcap" in done.stdout
+    done = imutool("conceal", "--open", "case", cwd=tmp_path)
+    assert done.returncode == 4
+    assert "Run imutool diagnose case/real.mcap --sim case/sim.mcap -o case" in done.stderr
     (tmp_path / "case" / FINDINGS).write_text(json.dumps(_findings([])))
     done = imutool("conceal", "--open", "case", "--json", "score.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -70,6 +70,13 @@ def test_evaluate_writes_the_numbers_of_its_table(logs: Path, tmp_path: Path, mo
             assert f'title="{one[name]!r}"' in page
 
 
+def test_a_page_says_once_that_a_model_does_not_fit(logs: Path, tmp_path: Path) -> None:
+    words = ["--model", "static", "--init", "0.3,0,0,0,0,0", "--report", tmp_path / "page.html"]
+    done = run("evaluate", logs / "flight_2.mcap", *words)
+    assert done.exit_code == 0, done.output
+    assert len(re.findall("static is (?:unfit|doubtful)", (tmp_path / "page.html").read_text())) == 1
+
+
 def test_debias_writes_a_page_of_the_new_log_and_refuses_before_the_work(logs: Path, tmp_path: Path) -> None:
     words = [logs / "flight_1.mcap", tmp_path / "out.mcap", "--model", logs / "linear.safetensors"]
     (tmp_path / "page.html").write_text("mine")

@@ -234,6 +234,23 @@ def test_a_source_is_never_the_target(tmp_path):
     assert content(tmp_path) == before
 
 
+@pytest.mark.parametrize("out", ["map.toml", "poses.csv"])
+def test_a_map_and_the_poses_that_it_names_are_never_the_target(tmp_path, out):
+    rows = "".join(f"{n * 10**7},0,0,0,0,0,9.81\n" for n in range(400))
+    (tmp_path / "imu.csv").write_text(f"t,gx,gy,gz,ax,ay,az\n{rows}")
+    (tmp_path / "poses.csv").write_text("t,qw,qx,qy,qz\n" + "".join(f"{n * 10**7},1,0,0,0\n" for n in range(400)))
+    (tmp_path / "map.toml").write_text(
+        'time = "t"\ntime_unit = "ns"\ngyro = ["gx", "gy", "gz"]\ngyro_unit = "rad/s"\naccel = ["ax", "ay", "az"]\n'
+        'accel_unit = "m/s^2"\ntruth_file = "poses.csv"\nquaternion_wxyz = ["qw", "qx", "qy", "qz"]\n'
+    )
+    before = content(tmp_path)
+    (tmp_path / "link").symlink_to(out)
+    with pytest.raises(ConfigError, match="is the source itself"):
+        convert(tmp_path / "imu.csv", tmp_path / "link", mapping=tmp_path / "map.toml", overwrite=True)
+    (tmp_path / "link").unlink()
+    assert content(tmp_path) == before
+
+
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no /proc, a place even root cannot write to")
 def test_a_read_only_target_is_refused(source):
     with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):

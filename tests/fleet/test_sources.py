@@ -77,9 +77,14 @@ def test_other_recordings_are_passed_over_and_counted(tmp_path: Path, caplog: py
         find(str(tmp_path), NOWHERE)
 
 
-def test_what_lies_in_out_is_no_source(tmp_path: Path) -> None:
+def test_what_lies_in_out_is_no_source(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     tree(tmp_path, "a.mcap", "out/a.mcap", "outer/a.mcap")
     assert names(tmp_path, tmp_path / "out") == ["a.mcap", "outer/a.mcap"]
+    assert "of its logs 1 are left out, for they lie below OUT" in caplog.text
+    caplog.clear()
+    (tmp_path / "out" / "fleet.journal").touch()  # then they are the results of an earlier run
+    assert names(tmp_path, tmp_path / "out") == ["a.mcap", "outer/a.mcap"]
+    assert not caplog.text
 
 
 def test_what_lies_in_out_is_no_source_whatever_link_leads_there(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -21,10 +22,12 @@ from imutool.processes.worker_pool import Outcome, WorkerBugError, WorkerDiedErr
 LEFT_S = 2.0
 
 
-def outcomes(folder: Path, actions: Iterable[str], *, workers: int = 2, retries: int = 0) -> dict[str, Outcome]:
+def outcomes(
+    folder: Path, actions: Iterable[str], *, workers: int = 2, retries: int = 0, limit_s: float = math.inf
+) -> dict[str, Outcome]:
     """By the name of each item: its number and what it does."""
     items = [(action, str(folder / f"{number} {action}")) for number, action in enumerate(actions)]
-    with WorkerPool(follow, workers, retries=retries) as pool:
+    with WorkerPool(follow, workers, retries=retries, limit_s=limit_s) as pool:
         return {Path(outcome.item[1]).name: outcome for outcome in pool.run(items)}
 
 
@@ -43,6 +46,18 @@ def test_every_item_has_one_outcome_and_a_bug_stops_no_other(tmp_path: Path) -> 
     assert str(error) == "ValueError('two and two is five')"
     assert "in follow" in error.trace
     assert len({pid for name in done for pid in tries(tmp_path, name)}) <= 2
+
+
+@pytest.mark.parametrize("action", ["last 60", "last 60 against SIGTERM"])
+def test_an_item_that_takes_too_long_is_given_up_and_no_other(tmp_path: Path, action: str) -> None:
+    begin = time.monotonic()
+    done = outcomes(tmp_path, [action, "well", "well"], retries=3, limit_s=1.0)
+    error = done[f"0 {action}"].error
+    assert isinstance(error, WorkerDiedError)
+    assert error.overdue
+    assert [name for name, outcome in done.items() if outcome.error] == [f"0 {action}"]
+    assert len(tries(tmp_path, f"0 {action}")) == 1
+    assert time.monotonic() - begin < 30.0
 
 
 def test_a_killed_worker_costs_a_sound_item_no_retry(tmp_path: Path) -> None:

@@ -34,7 +34,9 @@ def follow(item: tuple[str, str]) -> str:
         Ending()
         time.sleep(5.0)
     if what.startswith("last "):
-        time.sleep(float(what.removeprefix("last ")))
+        if what.endswith("against SIGTERM"):
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        time.sleep(float(what.split()[1]))
     return path
 
 

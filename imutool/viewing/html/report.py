@@ -19,7 +19,6 @@ from imutool.viewing.html import report_errors, report_paths, report_signals
 from imutool.viewing.html.drawing import HALF_INCH, WIDTH_INCH, Panel, Picture, png, prefix_ids, require_matplotlib, svg
 from imutool.viewing.html.page import cards, document, text
 from imutool.viewing.html.report_wording import (
-    best_run,
     conclusion,
     figure_label,
     format_number,
@@ -257,11 +256,11 @@ def _compared(logs: Sequence[RunData]) -> Iterator[str]:
     yield '<div class="scroll"><table class="numeric"><thead><tr>'
     yield "".join(f"<th{' class=word' * (title == 'Run')}>{title}</th>" for title in head) + "</tr></thead><tbody>"
     for k, data in enumerate(logs, start=1):
-        chosen = best_run(data)
-        for trace in data.traces:
+        best = index_of_best([trace.figures.get("aoe_deg") for trace in data.traces], "aoe_deg")
+        for row, trace in enumerate(data.traces):
             worst = worst_orientation_error(trace, data)
             values = [trace.figures.get(name) for name in ("aoe_deg", "ape_m", "velocity_rmse_m_s")]
-            cells = _cells([*values, None if worst is None else worst[0]], 0 if trace is chosen else None)
+            cells = _cells([*values, None if worst is None else worst[0]], 0 if row == best else None)
             name = f'<td><a href="#log{k}">{text(data.name)}</a></td><td class=word>{text(trace.name)}</td>'
             yield f"<tr>{name}<td class=number>{format_number(data.duration_s)}</td>{cells}</tr>"
     yield "</tbody></table></div>"

@@ -23,6 +23,7 @@ MARGIN = 0.06
 ASPECT = 1.25  # width over height of a panel
 DASHES: tuple[Any, ...] = ("-", (0, (7, 1.5, 1, 1.5)), (0, (1, 1)))  # of four models, of the next four, of the next
 KILOMETRES_M = 5000.0  # extent from which axes are in kilometres
+LONG_LABELS = 1e4  # coordinate from which labels, such as those of UTM, need the room of two
 MIN_EXTENT_M = 0.5  # of a picture: a log at rest is not magnified to millimetres
 
 Points = Float64[np.ndarray, "_ 3"]
@@ -172,6 +173,8 @@ def _equal(axes: Any, box: Float64[np.ndarray, "_ 2"], least: float) -> None:
     axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
     axes.locator_params(nbins=7)
+    if np.abs(middle[0]) >= LONG_LABELS:
+        axes.locator_params("x", nbins=4)
     axes.set_aspect("equal", adjustable="box")
 
 

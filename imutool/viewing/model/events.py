@@ -33,7 +33,7 @@ KIND_OF_RULE: Mapping[str, Kind] = {
     "not_finite": "not_finite",
 }
 MAX_EVENTS_PER_KIND = 100
-EXPONENT_FROM = 1000.0  # a larger error is written with all digits instead of an exponent
+EXPONENT_FROM = 1000.0  # a larger error or time is written with all digits instead of an exponent
 MAX_TEXT_LENGTH = 300  # letters; some come from files of others
 
 
@@ -56,11 +56,16 @@ def survey_events(survey: Survey) -> tuple[list[Event], list[str]]:
             notes.append(f"{finding.what[0].upper()}{finding.what[1:]}.")
             continue
         for start_ns, end_ns in finding.intervals_ns:
-            length = f" for {(end_ns - start_ns) * 1e-9:.3g} s" if end_ns > start_ns else ""
+            lasting = "for" if kind == "gap" else "within"  # a few samples near each other are one event
+            length = f" {lasting} {_three_digits((end_ns - start_ns) * 1e-9)} s" if end_ns > start_ns else ""
             events.append(Event(kind, start_ns, end_ns, f"{finding.what}{length} ({finding.count} in the log)"))
         if finding.intervals_left_out:
             notes.append(f"{finding.intervals_left_out} later intervals of {finding.what} are not listed as events.")
     return events, notes
+
+
+def _three_digits(value: float) -> str:
+    return f"{value:.3g}" if value < EXPONENT_FROM else f"{value:.0f}"
 
 
 def stop_events(imu: Imu) -> list[Event]:
@@ -75,7 +80,7 @@ def worst_error_events(name: str, errors: Errors) -> Iterator[Event]:
     for kind, total, unit in of_kind:
         if (row := row_of_largest(total)) is not None:
             at_ns = int(errors.t_ns[row])
-            size = f"{total[row]:.3g}" if total[row] < EXPONENT_FROM else f"{total[row]:.0f}"
+            size = _three_digits(float(total[row]))
             yield Event("worst", at_ns, at_ns, f"{name}: largest {kind} error, {size} {unit}")
 
 

@@ -7,7 +7,9 @@ import struct
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -122,7 +124,11 @@ def test_a_model_that_does_harm_is_not_praised(seen: RunData) -> None:
     said = report_wording.comparison(worse, raw)
     assert said.startswith("half raises the orientation error from")
     assert "(2.0 times) and leaves the position error about as it was" in said
-    assert report_wording.summary_of_logs([replace(seen, traces=(raw, worse))]).startswith("In 0 of 1 logs")
+    seen = replace(seen, traces=(raw, worse))
+    assert report_wording.summary_of_logs([seen]).startswith("In 0 of 1 logs")
+    with drawing_only():
+        compared = re.findall(r"<td class=word>(.*?)</td>.*?(best)?\" title", report.page([seen, replace(seen, name="other")]))
+    assert [best for _, best in compared] == ["best", "", "best", ""]  # the smallest error, here of raw
 
 
 def test_every_figure_is_in_the_table_to_the_last_digit_and_the_best_is_marked(seen: RunData, page: str) -> None:
@@ -369,6 +375,25 @@ def test_the_path_is_coloured_by_its_error_and_the_largest_keeps_its_colour(seen
     assert set(drawn) == {f"{low} to {low + 1} m" for low in (0, 6)} | {f"{k} to {k + 1} m" for k in range(1, 6)} - empty(drawn)
     assert len(drawn["6 to 7 m"]) >= 2
     assert report_paths.error_map(replace(seen, truth=None)) is None
+
+
+def test_labels_of_large_coordinates_do_not_touch(seen: RunData) -> None:
+    """UTM: steps of 2.5 m have labels of eight characters."""
+    assert seen.truth is not None
+
+    def moved(path: Poses) -> Poses:
+        return replace(path, p_wb=1.3 * path.p_wb + [691234.5, 5334567.8, 512.0])
+
+    traces = tuple(replace(trace, path=moved(trace.path)) for trace in seen.traces)
+    picture = report_paths.error_map(replace(seen, truth=moved(seen.truth), traces=traces))
+    assert picture is not None
+    figures, shown = list[Any](), picture.panels[0]
+    drawing.svg(
+        lambda figure: figures.append(figure) or shown.draw(figure), shown.height_inch, "x", width_inch=drawing.HALF_INCH
+    )
+    boxes = [label.get_window_extent() for label in figures[0].axes[0].get_xticklabels()]
+    assert len(boxes) >= 2
+    assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
 
 
 def test_gaps_of_the_samples_are_no_path_and_are_said(flown: Recording) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,15 @@ def test_a_planted_defect_is_an_event_at_its_time(good: Recording, kind: str) ->
     assert int(t_ns[2995]) <= event.start_ns <= int(t_ns[3005])
     assert event.end_ns == (int(t_ns[3200]) if kind == "gap" else event.start_ns)
     assert "in the log" in event.text
+
+
+def test_samples_apart_are_within_a_time_and_do_not_fill_it(good: Recording) -> None:
+    """Of 16 samples at the end of their range it said that they are there for 2 s."""
+    batch = batch_of(good.imu)
+    for row in (3000, 3010):
+        batch = with_values(batch, row, 0, np.nan)
+    assert re.search(r" within 0\.05 s \(2 in the log\)", found_in(batch)[0][0].text)
+    assert re.search(r" for 1\.01 s \(", found_in(without(batch_of(good.imu), slice(3000, 3200)))[0][0].text)
 
 
 def test_what_is_found_without_a_time_is_a_sentence(good: Recording) -> None:

@@ -369,7 +369,10 @@ def test_the_command_replays_a_log_and_reports_the_delay(logs: Path, tmp_path: P
     assert imutool(*words, cwd=tmp_path).returncode == 3  # the file exists
 
 
-def test_standard_input_is_printed_debiased_until_ctrl_c(imu: Imu, tmp_path: Path, command: str) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_standard_input_is_printed_debiased_until_ctrl_c(
+    imu: Imu, tmp_path: Path, command: str, number: signal.Signals
+) -> None:
     line = [command, "live", "--from", "stdin", "--no-view", "--print", "--json", str(tmp_path / "r.json")]
     with subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdin is not None
@@ -381,7 +384,7 @@ def test_standard_input_is_printed_debiased_until_ctrl_c(imu: Imu, tmp_path: Pat
         printed = [json.loads(process.stdout.readline()) for _ in range(len(imu))]
         writer.join()
         time.sleep(0.2)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         told = process.stderr.read()
         assert process.wait(30) == 0, told
     assert [row["t_ns"] for row in printed] == imu.t_ns.tolist()
