@@ -154,6 +154,7 @@ class TrainingReport(Report, frozen=True, kw_only=True, tag="imutool.training/1"
     sessions: list[dict[str, Any]]
     turn_on_least_std: list[float] | UnsetType = UNSET  # of the next session's bias; older models have none
     speed: dict[str, float] | UnsetType = UNSET  # of the logs, where the filter's own bound is too small
+    turn_error: float | UnsetType = UNSET  # share of a turn that the filter takes for wrong
     compared: dict[str, Any] | UnsetType = UNSET
     physics: dict[str, Any] | UnsetType = UNSET
     left_out: dict[str, Any] | UnsetType = UNSET
