@@ -90,7 +90,9 @@ def contradictions(logs: Sequence[WhitenedLog], selection: Selection) -> Iterato
     """
     found, always = selection.whole, selection.always
     beside = [
-        effect for effect in catalogue.diagnosed((*OF_UNIT, *OF_LOG)) if not any(exclude_each_other(effect, one) for one, _ in found.chosen)
+        effect
+        for effect in catalogue.diagnosed((*OF_UNIT, *OF_LOG))
+        if not any(exclude_each_other(effect, one) for one, _ in found.chosen)
     ]
     chosen = (*found.chosen, *((effect, effect.null_value.astype(float)) for effect in beside))
     whole = fit(logs, chosen, found.part)

@@ -172,7 +172,7 @@ def test_a_simulation_of_the_motion_of_some_recordings_only_is_refused(tmp_path:
 def test_a_recording_that_contradicts_the_others_is_named(
     differs: str, stranger: Mapping[str, Sequence[float]], long_s: float, tmp_path: Path
 ) -> None:
-    """Also one that outweighs the others, or differs on one axis alone, in its clock, or in what two matrices would do as well."""
+    """Also one that outweighs the others, or differs on one axis alone, by its clock, or in what two matrices do."""
     of_one_unit = logs_of_one_unit(tmp_path)
     of_another = log(tmp_path, "stranger", 11, stranger, long_s=long_s)
     found = diagnose([*of_one_unit, of_another])
