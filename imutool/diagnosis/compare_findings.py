@@ -37,6 +37,7 @@ OF_READING = (  # or of its rest, where rounding errs by a constant
 )
 NAMED_SHARE = 0.05  # of the squares that rounding adds, which an effect with a name has to remove
 OF_UNIT = ("gyro_scale", "gyro_misalignment", "accel_scale", "accel_misalignment", "mount_rotation")  # its own, or its mount's
+OF_LOG = ("clock_offset", "clock_skew")  # its clock, which may be another than that of the others
 ANOTHER_MOTION = "the simulation is of another motion; each was compared with its own true poses"
 
 
@@ -88,9 +89,10 @@ def contradictions(logs: Sequence[WhitenedLog], selection: Selection) -> Iterato
     Numbers in which units and mounts differ are fitted beside the findings: what only some recordings have is not among these.
     """
     found, always = selection.whole, selection.always
-    names = (*OF_UNIT, "clock_offset") if all(log.pair.exact for log in logs) else OF_UNIT  # poses have a clock of their own
     beside = [
-        effect for effect in catalogue.diagnosed(names) if not any(exclude_each_other(effect, one) for one, _ in found.chosen)
+        effect
+        for effect in catalogue.diagnosed((*OF_UNIT, *OF_LOG))
+        if not any(exclude_each_other(effect, one) for one, _ in found.chosen)
     ]
     chosen = (*found.chosen, *((effect, effect.null_value.astype(float)) for effect in beside))
     whole = fit(logs, chosen, found.part)

@@ -1,93 +1,25 @@
-"""Export a diagnosed sensor as a simulator's configuration, with ranges.
+"""Write a diagnosed sensor as a simulator's configuration, with ranges.
 
-The physics of one diagnosis, or of a fleet's: means, and ranges for domain randomisation of two deviations, of the fits and
-among the units.
 What a simulator has no word for is listed, and stays in the physics.toml and noise.toml that are written as well.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
-import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
-from imutool.errors import ConfigError, DataError
 from imutool.exporting import ExportReport
+from imutool.exporting.twin import DEVIATIONS, NOISE, PHYSICS, Twin, read
 from imutool.mcap_io.storage.target import Target, writing
 from imutool.noise import datasheet
-from imutool.noise.datasheet import Noise
-from imutool.recording import GRAVITY_M_S2
 from imutool.sensor import physics_file
-from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
-from imutool.units import AXES, SENSORS, Sensor, three
+from imutool.units import AXES, SENSORS, three
 
-PHYSICS, NOISE = "physics.toml", "noise.toml"
-MOST_BIAS_M_S2 = 0.6 * GRAVITY_M_S2  # of an accelerometer; with a larger one it measures no gravity
-RATE_HZ = 200.0  # of a sensor whose rate neither the given noise nor the diagnosed one says
-DEVIATIONS = 2.0  # of a range
 CORRELATION_S = 3600.0  # of a bias that walks, where a simulator lets it come back
-Vector = Float64[np.ndarray, "3"]
-
-
-@dataclass(frozen=True, eq=False)
-class Twin:
-    """Sensor of a fleet: physics, spread of the bias, noise; `used`: the effects expressed."""
-
-    physics: PhysicsFile
-    bias_std: Mapping[Sensor, Vector]
-    noise: Noise
-    units: int
-    rate_hz: float = RATE_HZ
-    used: set[str] = field(default_factory=set)
-
-    def vector(self, effect: str) -> Vector:
-        """Three parameters of an effect, zero where it is not known."""
-        entry = next((entry for entry in self.physics.effect if entry.name == effect), None)
-        if entry is None:
-            return np.zeros(3)
-        self.used.add(effect)
-        return np.array([next((v.value for k, v in entry.parameters.items() if k[-1] == axis), 0.0) for axis in AXES])
-
-    def value(self, effect: str, parameter: str) -> float | None:
-        """One parameter of an effect."""
-        for entry in self.physics.effect:
-            if entry.name == effect and parameter in entry.parameters:
-                self.used.add(effect)
-                return entry.parameters[parameter].value
-        return None
-
-    def rotation(self) -> Rotation:
-        """Attitude of the sensor on its body."""
-        return Rotation.from_rotvec(self.vector("mount_rotation"))
-
-    def bias(self, sensor: Sensor) -> Vector:
-        """Mean bias of a sensor."""
-        return np.zeros(3) if self.physics.bias is None else np.array(getattr(self.physics.bias, sensor))
-
-    def std(self, sensor: Sensor) -> Vector:
-        """Standard deviation of a sample's noise."""
-        return np.asarray(np.nan_to_num(self.noise.values(f"{sensor}_density")) * np.sqrt(self.rate_hz))
-
-    def ranges(self) -> dict[str, tuple[float, float, float, str]]:
-        """Value, low, high and unit of every parameter with a name."""
-        out = {}
-        for entry in self.physics.effect:
-            for name, value in entry.parameters.items():
-                half = DEVIATIONS * (value.std or 0.0)
-                out[f"{entry.name}.{name}"] = (value.value, value.value - half, value.value + half, value.unit)
-        for sensor in SENSORS:
-            low, high = (1.0, 1.0) if self.noise.colour is None else getattr(self.noise.colour, f"{sensor}_range")
-            for axis, std in zip(AXES, self.std(sensor), strict=True):
-                out[f"{sensor}_noise.{axis}"] = (float(std), float(std * low), float(std * high), "")
-            for axis, mean, std in zip(AXES, self.bias(sensor), self.bias_std[sensor], strict=True):
-                out[f"{sensor}_bias.{axis}"] = (float(mean), float(mean - DEVIATIONS * std), float(mean + DEVIATIONS * std), "")
-        return out
 
 
 def write(source: Path, out: Path, form: str, noise: str | Path | None, overwrite: bool) -> ExportReport:
@@ -112,61 +44,8 @@ def write(source: Path, out: Path, form: str, noise: str | Path | None, overwrit
     if text_of is not None:
         left_out += [f"a curve of {curve.variable}" for curve in twin.physics.unknown] + [t.term for t in twin.physics.term]
         left_out += ["the colour of the noise"] * (twin.noise.colour is not None)
+    left_out += twin.of_some
     return ExportReport(out, form, None, dict.fromkeys(texts, 1), left_out)
-
-
-def read(source: Path, noise: str | Path | None = None) -> Twin:
-    """Twin of one diagnosis or of several.
-
-    Raises:
-        ConfigError: no physics.toml, or no noise.
-        DataError: the physics of samples in another unit.
-    """
-    folders = [source] if (source / PHYSICS).is_file() else sorted(path.parent for path in source.glob(f"*/{PHYSICS}"))
-    if not folders:
-        raise ConfigError("holds no diagnosis", where=source, expected=f"the folder of imutool diagnose, with {PHYSICS}")
-    files = [physics_file.read(folder / PHYSICS) for folder in folders]
-    noises = [datasheet.read(folder / NOISE) for folder in folders if (folder / NOISE).is_file()]
-    if noise is None and not noises:
-        raise ConfigError(f"holds no {NOISE}", where=source, fix="Diagnose again, or give `noise`")
-    sheet = datasheet.read(noise) if noise is not None else _middle(noises)
-    biases = {s: np.array([getattr(file.bias, s) for file in files if file.bias is not None]).reshape(-1, 3) for s in SENSORS}
-    known = {s: rows for s, rows in biases.items() if len(rows)}
-    for folder, file in zip(folders, files, strict=True):
-        if file.bias is not None and (size := float(np.linalg.norm(file.bias.accel))) > MOST_BIAS_M_S2:
-            what = f"{PHYSICS} has an accelerometer's bias of {size:.3g} m/s²: its log does not measure gravity, or not in m/s²"
-            raise DataError(what, where=folder, fix="Correct the log with imutool convert LOG OUT --fix, and diagnose it again")
-    mean = Bias(**{s: three(rows.mean(axis=0)) for s, rows in known.items()}) if known else None
-    std: dict[Sensor, Vector] = {s: rows.std(axis=0, ddof=1) if len(rows) > 1 else np.zeros(3) for s, rows in biases.items()}
-    physics = files[0] if len(files) == 1 else _of_fleet(files)
-    rates = [each.colour.rate_hz for each in (sheet, *noises) if each.colour is not None]
-    return Twin(msgspec.structs.replace(physics, bias=mean), std, sheet, len(files), next(iter(rates), RATE_HZ))
-
-
-def _of_fleet(files: list[PhysicsFile]) -> PhysicsFile:
-    """Effects that most units have, with the mean and spread of each parameter; curves and terms belong to one unit."""
-    found: dict[tuple[str, str, str], list[Entry]] = {}
-    for file in files:
-        for entry in file.effect:
-            found.setdefault((entry.name, entry.signal or entry.column, entry.driver), []).append(entry)
-    common = [entries for entries in found.values() if 2 * len(entries) > len(files)]
-    return PhysicsFile(effect=tuple(_pooled(entries) for entries in common))
-
-
-def _pooled(entries: list[Entry]) -> Entry:
-    values = {}
-    for name, first in entries[0].parameters.items():
-        own = [entry.parameters[name] for entry in entries if name in entry.parameters]
-        x, std = np.array([v.value for v in own]), np.array([v.std or 0.0 for v in own])
-        spread = float(x.std(ddof=1)) if len(x) > 1 else 0.0
-        values[name] = Value(value=float(x.mean()), std=float(np.hypot(spread, np.sqrt((std**2).mean()))), unit=first.unit)
-    return msgspec.structs.replace(entries[0], parameters=values)
-
-
-def _middle(noises: list[Noise]) -> Noise:
-    """The unit with the middle noise; a colour cannot be averaged."""
-    sizes = [float(np.nansum(noise.values("accel_density"))) for noise in noises]
-    return noises[int(np.argsort(sizes)[len(sizes) // 2])]
 
 
 def _numbers(values: Float64[np.ndarray, " n"] | tuple[float, ...]) -> str:
@@ -255,7 +134,11 @@ def _gazebo(twin: Twin) -> str:
 
 
 def _isaac(twin: Twin) -> str:
-    """Python of Isaac Lab's configuration classes (isaaclab.sensors, isaaclab.utils.noise)."""
+    """Python of Isaac Lab's configuration classes (isaaclab.sensors, isaaclab.utils.noise).
+
+    A bias has one column until a noise model is first called, and is drawn before: its range is a number, and its mean is the
+    noise's.
+    """
     wxyz = tuple(map(float, twin.rotation().as_quat(scalar_first=True)))
     lines = [
         f'"""IMU of {twin.units} diagnosed unit(s): sensor, noise, and ranges (low, high) for domain randomisation."""',
@@ -271,14 +154,12 @@ def _isaac(twin: Twin) -> str:
         ")",
     ]
     for sensor in SENSORS:
-        mean, half = twin.bias(sensor), DEVIATIONS * twin.bias_std[sensor]
-        low, high, std = (
-            (f"torch.tensor({list(map(float, values))})") for values in (mean - half, mean + half, twin.std(sensor))
-        )
+        mean, std = (f"torch.tensor({list(map(float, values))})" for values in (twin.bias(sensor), twin.std(sensor)))
+        half = DEVIATIONS * float(twin.bias_std[sensor].max())
         lines += [
             f"{sensor.upper()}_NOISE = NoiseModelWithAdditiveBiasCfg(",
-            f"    noise_cfg=GaussianNoiseCfg(mean=0.0, std={std}),",
-            f'    bias_noise_cfg=UniformNoiseCfg(n_min={low}, n_max={high}, operation="abs"),',
+            f"    noise_cfg=GaussianNoiseCfg(mean={mean}, std={std}),",
+            f'    bias_noise_cfg=UniformNoiseCfg(n_min={0.0 - half!r}, n_max={half!r}, operation="abs"),',
             ")",
         ]
     ranges = twin.ranges().items()

@@ -469,6 +469,11 @@ def test_a_sensor_that_rests_on_its_side_is_at_no_end_of_its_range() -> None:
     assert saturation.at_limit(values)[1:600].all()  # where nothing exceeds it, it may be the end of a range
 
 
+def test_slow_motion_without_noise_is_not_flat_where_it_turns_back():
+    """A simulation of a boat lost the crests of its waves: 1509 of 15000 samples of its gyro were said to be clipped."""
+    assert not saturation.at_limit(0.08 * np.sin(0.3 * np.arange(0.0, 60.0, 0.005))).any()
+
+
 def test_a_long_rest_near_the_largest_value_hides_no_plateau_far_above_it(monkeypatch):
     """As gravity at rest before a flight: too many samples to be held, until a larger value shows what they were."""
     monkeypatch.setattr(saturation, "MOST_NEAR", 5000)

@@ -165,12 +165,14 @@ def test_a_simulation_of_the_motion_of_some_recordings_only_is_refused(tmp_path:
         ("gyro_scale", {"gyro_scale": [-0.02, 0.01, 0.03]}, 150.0),
         ("gyro_scale", {"gyro_scale": [0.02, 0.006, -0.015]}, planted.DURATION_S),
         ("mount_rotation", {"gyro_scale": SCALE, "mount_rotation": [0.05, 0.0, 0.0]}, planted.DURATION_S),
+        ("clock_offset", {"gyro_scale": SCALE, "clock_offset": [0.02]}, planted.DURATION_S),  # a matrix did a part of it
+        ("clock_skew", {"gyro_scale": SCALE, "clock_skew": [8e-4]}, planted.DURATION_S),  # nothing was named
     ],
 )
 def test_a_recording_that_contradicts_the_others_is_named(
     differs: str, stranger: Mapping[str, Sequence[float]], long_s: float, tmp_path: Path
 ) -> None:
-    """Also one that outweighs the others, that differs on one axis alone, or in what two matrices would do as well."""
+    """Also one that outweighs the others, or differs on one axis alone, by its clock, or in what two matrices do."""
     of_one_unit = logs_of_one_unit(tmp_path)
     of_another = log(tmp_path, "stranger", 11, stranger, long_s=long_s)
     found = diagnose([*of_one_unit, of_another])

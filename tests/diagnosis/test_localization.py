@@ -50,14 +50,16 @@ def test_a_misfit_that_is_certain_and_shows_in_no_second_lies_everywhere() -> No
     assert locate(T, weak, NOISE, {}, {"accel": 1e-4}) == []
 
 
-@pytest.mark.parametrize(("rate_hz", "noisier"), [(50.0, 1.0), (200.0, 1.0), (200.0, 3.0)])
-def test_a_residual_lies_where_it_stands_out_of_the_noise(rate_hz: float, noisier: float) -> None:
-    """A burst on one axis of residuals that are all noise, also where the noise is more than is known."""
+@pytest.mark.parametrize(
+    ("rate_hz", "noisier", "f_hz"), [(50.0, 1.0, 3.0), (200.0, 1.0, 3.0), (200.0, 3.0, 3.0), (100.0, 1.0, 23.0)]
+)
+def test_a_residual_lies_where_it_stands_out_of_the_noise(rate_hz: float, noisier: float, f_hz: float) -> None:
+    """A burst on one axis of noise, also where the noise is more than is known, or a mean holds its ends alone."""
     t_s, rng = np.arange(int(80.0 * rate_hz)) / rate_hz, np.random.default_rng(5)
     residual = noisier * NOISE * rng.normal(size=(len(t_s), 6))
     alone = located_residual(residual, rate_hz)
     assert [(one.signal, one.intervals_s) for one in alone] == [("gyro", ((0.0, 80.0),))], "certain, and in no second"
-    residual[:, 1] += 15.0 * NOISE[1] * np.sin(2.0 * np.pi * 3.0 * t_s) * ((t_s >= 30.5) & (t_s < 39.5))
+    residual[:, 1] += 15.0 * NOISE[1] * np.sin(2.0 * np.pi * f_hz * t_s) * ((t_s >= 30.5) & (t_s < 39.5))
     (one,) = located_residual(residual, rate_hz)
     assert (one.signal, one.axes, one.intervals_s) == ("gyro", ("y",), ((30.0, 40.0),))
 

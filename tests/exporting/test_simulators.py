@@ -144,8 +144,9 @@ def test_isaac_is_python_with_the_classes_of_isaac_lab(tmp_path: Path, monkeypat
     exec(compile((tmp_path / "out" / "imu.py").read_text(), "imu.py", "exec"), made)
     assert made["IMU"].values["offset"].pos == ARM
     assert made["IMU"].values["update_period"] == 1.0 / RATE_HZ
+    np.testing.assert_allclose(made["GYRO_NOISE"].values["noise_cfg"].values["mean"].numpy(), (0.01, 0.0, -0.02), rtol=1e-6)
     bias = made["GYRO_NOISE"].values["bias_noise_cfg"].values
-    np.testing.assert_allclose(bias["n_min"].numpy(), (0.01, 0.0, -0.02), rtol=1e-6)
+    assert (bias["n_min"], bias["n_max"]) == (0.0, 0.0)  # a row of three does not fit the one column of a bias at a reset
     assert made["RANGES"]["gyro_scale.x"] == pytest.approx((0.018, 0.022))
 
 
@@ -160,6 +161,26 @@ def test_a_fleet_gives_means_and_ranges(tmp_path: Path) -> None:
     assert file.bias is not None
     assert file.bias.gyro[0] == pytest.approx(0.01)
     assert datasheet.read(tmp_path / "out" / "noise.toml") == NOISE
+
+
+def _lines(*f_hz: float) -> tuple[Entry, ...]:
+    return tuple(Entry(name="vibration", signal="accel", parameters={"f": Value(value=hz, unit="Hz")}) for hz in f_hz)
+
+
+def test_two_lines_of_a_vibration_stay_two(tmp_path: Path) -> None:
+    """The mean of 30 and 90 Hz was one line at 60 Hz; of a unit alone the second took the range of the first."""
+    step = Entry(name="gyro_bias_step", signal="gyro", parameters={"t_step": Value(value=20.0, unit="s")})
+    scale = Entry(name="gyro_scale", signal="gyro", parameters={"x": Value(value=0.02, unit="-")})
+    for name, effects in {"a": (*_lines(30.0, 90.0), step), "b": (*_lines(92.0, 32.0), step, scale)}.items():
+        (tmp_path / "fleet" / name).mkdir(parents=True)
+        physics_file.write(PhysicsFile(effect=effects), tmp_path / "fleet" / name / "physics.toml")
+        datasheet.write(NOISE, tmp_path / "fleet" / name / "noise.toml")
+    report = export(tmp_path / "fleet", tmp_path / "out", format="mujoco")
+    found = physics_file.read(tmp_path / "out" / "physics.toml").effect
+    assert [entry.parameters["f"].value for entry in found] == [31.0, 91.0]
+    assert report.left_out[-2:] == ["gyro_bias_step of 2 of 2 units", "gyro_scale of 1 of 2 units"]
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "imu.xml"))
+    assert [model.numeric(f"imu.vibration_accel{n}.f").data[0] for n in ("", "_2")] == [31.0, 91.0]
 
 
 def test_what_is_no_diagnosis_is_refused(tmp_path: Path) -> None:

@@ -109,28 +109,35 @@ class _Near:
         return self._parts[0]
 
 
+def _middles(steps: Float64[np.ndarray, "b n"]) -> Float64[np.ndarray, " b"]:
+    """Median of each row; np.median imports numpy.ma."""
+    half = steps.shape[1] // 2
+    return np.asarray(np.sort(steps, axis=1)[:, half - 1 : half + 1].mean(axis=1))
+
+
 class Plateau:
     """Samples near an end of an axis that change less than at rest.
 
-    A sensor that is clipped before its calibration for temperature or scale has no value that repeats.
+    A sensor that is clipped before its calibration for temperature or scale has no value that repeats. Steps of noise differ from
+    one to the next by sqrt(3) of their size; smooth motion without noise is calm wherever it turns back, and no plateau.
     """
 
     def __init__(self) -> None:
         self._last, self._samples = np.nan, 0
-        self._blocks = [np.zeros((2, 0))]  # largest size and median step
+        self._blocks = [np.zeros((2, 0))]  # largest size, and median step of the noise
         self._extreme = {-1: 0.0, 1: 0.0}
         self._near = {-1: _Near(), 1: _Near()}
 
     def see(self, values: Float64[np.ndarray, " n"], number: Numbers, stamp_ns: Int64[np.ndarray, " n"]) -> None:
         """Add the next samples, in order."""
         finite = np.isfinite(values)
-        step = np.nan_to_num(np.abs(np.diff(values, prepend=self._last)), nan=np.inf)
+        signed = np.diff(np.where(finite, values, np.nan), prepend=self._last)
+        step = np.nan_to_num(np.abs(signed), nan=np.inf)
         self._last, self._samples = values[-1] if len(values) else self._last, self._samples + len(values)
         whole = len(values) // BLOCK * BLOCK
-        ordered = np.sort(step[:whole].reshape(-1, BLOCK), axis=1)
-        middle = ordered[:, BLOCK // 2 - 1 : BLOCK // 2 + 1].mean(axis=1)  # np.median imports numpy.ma
-        blocks = (np.abs(values[:whole]).reshape(-1, BLOCK).max(axis=1), middle)
-        self._blocks.append(np.stack(blocks))
+        steps = signed[:whole].reshape(-1, BLOCK)
+        calm = np.minimum(_middles(np.abs(steps)), _middles(np.abs(np.diff(steps, axis=1))) / np.sqrt(3.0))
+        self._blocks.append(np.stack([np.abs(values[:whole]).reshape(-1, BLOCK).max(axis=1), calm]))
         for side, near in self._near.items():
             self._extreme[side] = float(np.max(side * values, where=finite, initial=self._extreme[side]))
             kept = side * values > (least := BAND * self._extreme[side])

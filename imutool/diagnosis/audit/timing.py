@@ -48,6 +48,8 @@ def timing_faults(estimates: Mapping[str, Estimate], period_s: float, filters: t
         if signals:
             signal = "both" if len(signals) == 2 else signals[0]
             out.append(found(name, signal, delay=with_unit(late[signals[0]], "s")))
+    if steps["accel"] == "step_delay" and not together:  # positions were differentiated twice: the attitude is in time
+        steps["accel"] = "backward_difference"
     for signal, kind in steps.items():
         if kind == "backward_difference" and (signal == "gyro" or abs(attitude.value) < 0.5 * abs(accel.value)):
             tau = late[signal]

@@ -47,7 +47,7 @@ def with_simulation(
     shift_s = _shift(real.imu, sim.imu, settings.alignment)
     if shift_s is None:
         raise DataError(
-            "the simulation and the recording turn differently",
+            "the simulation and the recording turn differently, or too slowly to be aligned without a common clock",
             where=real.name,
             expected="one motion, or true poses in both logs",
             fix="Leave `sim` out to compare the recording with its own true poses",

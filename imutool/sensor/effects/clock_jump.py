@@ -10,6 +10,7 @@ from imutool.sensor.samples import IdealMotion, SensorSamples, Times
 
 Column = Float64[np.ndarray, " n"]
 Steps = Float64[np.ndarray, " n-1"]
+NOTHING = 1e-9  # of the squared slopes: what rounding leaves where nothing has moved yet, or nothing moves any more
 PARTS, STARTS, ON_TREND = 12, 4, 1  # of the log; the best times of how many of them, with two offsets and on a trend
 
 
@@ -45,7 +46,7 @@ def _steps(trend: Float64[np.ndarray, "n p"], common: Column, power: Column) -> 
     after = np.cumsum((power[:, None] * trend)[::-1], axis=0)[::-1][1:]
     left = np.cumsum(common[::-1])[::-1][1:] - after @ whole @ (trend.T @ common)
     own = np.cumsum(power[::-1])[::-1][1:] - np.einsum("np,pq,nq->n", after, whole, after)
-    step = left / np.maximum(own, np.finfo(np.float64).tiny)
+    step = np.where(own > NOTHING * power.sum(), left, 0.0) / np.maximum(own, NOTHING * power.sum())
     return step, step * left
 
 

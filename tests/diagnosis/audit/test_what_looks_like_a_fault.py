@@ -129,6 +129,10 @@ def test_what_grows_with_the_frequency_is_an_error_of_the_curve() -> None:
         ({"tau_g": (0.51, 0.006), "tau_a": (-0.31, 0.04), "tau_f": (-0.02, 0.05)}, {("backward_difference", "gyro")}),
         ({"tau_g": (0.25, 1e-3), "tau_a": (0.747, 3e-3), "tau_f": (2e-3, 3e-3)}, {("backward_difference", "accel")}),
         ({"tau_g": (1.0, 1e-3), "tau_a": (1.0, 0.01), "tau_f": (0.9, 0.1)}, {("step_delay", "both")}),
+        (
+            {"tau_g": (0.0, 1e-3), "tau_a": (1.0, 1e-3), "tau_f": (2e-3, 3e-3)},
+            {("backward_difference", "accel")},
+        ),  # of positions
     ],
 )
 def test_delays_of_gyro_acceleration_and_attitude_are_weighed_together(
