@@ -301,6 +301,8 @@ def test_a_log_that_is_given_twice_is_refused(imutool: Any, tmp_path: Path, logs
     run = api.diagnose if words == ["diagnose"] else partial(api.train, out=tmp_path / "m.safetensors")
     with pytest.raises(ConfigError, match="is given twice"):
         run([tmp_path / "a.mcap", str(tmp_path / "a.mcap")])
+    with pytest.raises(ConfigError, match="are given twice"):
+        run([api.read(tmp_path / "a.mcap"), api.read(tmp_path / "a.mcap")])
 
 
 def test_a_file_is_asked_for_once_to_find_logs_that_are_given_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

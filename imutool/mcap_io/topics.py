@@ -260,7 +260,8 @@ def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callab
         if message is not None:
             found[name] = _as_ros(topic, message)
     imus = {name: topic for name, topic in {**topics, **found}.items() if topic.schema_name == schemas.IMU}
-    odd = {n for n, t in imus.items() if (d := definitions[n]) and not t.reflected and not ros2_definition.is_imu_of_ros(d.data)}
+    own = {name: definition for name, topic in imus.items() if (definition := definitions[name]) and not topic.reflected}
+    odd = {name for name, definition in own.items() if not ros2_definition.is_imu_of_ros(definition.data)}
     known = any(not topic.is_derived for name, topic in imus.items() if name not in odd)
     for name, topic in topics.items():
         described = (topic.schema_encoding, topic.message_encoding, topic.is_derived) == ("ros2msg", "cdr", False)
