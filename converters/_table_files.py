@@ -22,7 +22,7 @@ from ._table_mat import check_size, load_mat, names_of_mat
 from ._table_merged import join_stamps, sort_by_clock
 from ._table_mocap import is_mocap, read_mocap
 from ._table_motion import add_gravity
-from ._table_names import group_of, leaf_of, tells_apart
+from ._table_names import TIME_WORDS, group_of, leaf_of, split_name, tells_apart
 from ._table_numbers import is_number
 from ._table_packed import goes_back, read_bytes, text_head
 from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated, state_mip
@@ -101,7 +101,19 @@ def may_hold_several(path: Path) -> bool:
     in_groups = kind in OF_GROUPS and len({*map(group_of, names)} | {""}) > 2
     if kind in ("json", "sheets") or in_groups or any(tells_apart(leaf_of(name)) for name in names):
         return True
-    return kind == "csv" and goes_back(path)
+    return goes_back(path) if kind == "csv" else kind == "parquet" and _times_fall(path, names)
+
+
+def _times_fall(path: Path, names: list[str]) -> bool:
+    """Whether a time of a Parquet file goes back."""
+    times = [name for name in names if re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(name)[0])]
+    with refusing(path):
+        for column in _module("pyarrow.parquet", path).read_table(path, columns=times).columns if times else ():
+            if re.match(NUMBERS, str(column.type)) and column.null_count == 0:
+                values = column.to_numpy()
+                if (np.diff(values.astype(np.int64 if values.dtype.kind == "M" else float)) < 0).any():
+                    return True
+    return False
 
 
 def _names_of(path: Path, kind: str) -> list[str]:

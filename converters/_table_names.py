@@ -75,6 +75,7 @@ FORMS = (  # names of an axis, by falling preference; one of roll, pitch and yaw
     rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[xyz])_?(?P<place>\d|{PLACES}|(imu|sensor)_?\d?){STATE}",  # ax1, acc_x_chest
     rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<place>\d|{PLACES})_?(?P<axis>[xyz]){STATE}",  # acc1_x, acc_chest_x
     rf"(?P<sensor>(?:.*_)?(WORDS))(?P<state>{STATES})_?(?P<axis>[xyz012])",  # acc_raw_x
+    rf"(?P<sensor>(?:.*_)?(?=[a-z]{{2}})(WORDS)){STATE}_(?P<nth>[1-9])",  # acc_1, as MATLAB names the columns of a matrix
 )
 SYMBOLS = {  # of an aircraft; specific force, or in the axes of the body, where gravity shows that it is no bias
     "gyro": r"(?P<sensor>)(?P<axis>[pqr])",
@@ -118,7 +119,8 @@ def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[st
             found = match.groupdict()
             owner = f"{re.sub(r'^(?=[0-9])', 'imu', found['place'])}_" if "place" in found else found.get("of", "")
             group = groups.setdefault((owner + found["sensor"], found.get("state", "")), {})
-            group[axes.get(found["axis"], found["axis"])] = column
+            axis = found["axis"] if "axis" in found else "xyz456789"[int(found["nth"]) - 1]
+            group[axes.get(axis, axis)] = column
     whole = {key: group for key, group in groups.items() if set(group) == set("xyz")}
     whole = {(name, state): group for (name, state), group in whole.items() if not state or (name, "") not in whole}
     owners = [re.sub(rf"(^|_)({WORDS[sensor]})$", "", name) for name, _ in whole]

@@ -176,6 +176,23 @@ def test_a_table_of_ulog2csv_is_in_the_units_of_px4(tmp_path):
     np.testing.assert_allclose(imu.gyro, 0.01 * COUNTS, rtol=1e-12)
 
 
+def test_matrices_as_matlab_writes_them_in_a_table(tmp_path):
+    """`acc_1` to `acc_3`: their rate stands in a comment, and the orientation beside them shows the gyro's unit."""
+    t_s = np.arange(2000) * 0.01
+    turned = Rotation.from_rotvec(np.stack([0.4 * np.sin(2 * t_s), 0.5 * np.sin(3 * t_s), 0.3 * np.cos(2 * t_s)], axis=1))
+    gyro = np.vstack([(turned[:-1].inv() * turned[1:]).as_rotvec() * 100.0, np.zeros((1, 3))])
+    accel, wxyz = turned.inv().apply([0.0, 0.0, 9.81]), turned.as_quat()[:, [3, 0, 1, 2]]
+    names = [*(f"ori_{n}" for n in "1234"), *(f"acc_{n}" for n in "123"), *(f"gyr_{n}" for n in "123")]
+    path = write_csv(tmp_path / "imu.csv", names, [*wxyz.T, *accel.T, *np.rad2deg(gyro).T])
+    path.write_text(f"// fs=100 nSamples=2000\n{path.read_text()}")
+    imu = read(path).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, gyro, atol=1e-9)
+    assert imu.period_s == pytest.approx(0.01)
+    four = write_csv(tmp_path / "four.csv", ["t", *(f"acc_{n}" for n in "1234"), *(f"gyr_{n}" for n in "1234")], [T_S] * 9)
+    with pytest.raises(ConfigError, match="no columns look like the gyro"):
+        read(four)
+
+
 @pytest.mark.parametrize("sentence", ["VNIMU", "VNYMR", "VNQMR"])
 def test_sentences_of_a_vectornav_lack_a_time_alone(tmp_path, sentence):
     ahead = {"VNIMU": "", "VNYMR": "10.0,20.0,30.0,", "VNQMR": "0.0,0.0,0.0,1.0,"}[sentence] + "+1.1,-0.2,+0.3,"
