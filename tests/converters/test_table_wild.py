@@ -50,6 +50,16 @@ def test_the_steps_of_a_register_show_the_unit_of_the_gyro(tmp_path, unit, step,
     assert any(f" {unit}, as a common sensor does" in note for note in log.remarks.notes)
 
 
+@pytest.mark.parametrize(
+    ("unit", "step", "digits"), [("deg/s", 1 / 131, 15), ("deg/s", 0.07, 6), ("rad/s", np.deg2rad(1 / 16.4), 7)]
+)
+def test_the_steps_of_a_gesture_show_the_unit_too(unit, step, digits):
+    counts = np.round(np.random.default_rng(4).normal(0.0, 4000.0, (300, 3)))
+    rates = np.vectorize(lambda value: float(f"{value:.{digits}g}"))(counts * step)
+    assert unit_by_steps(rates) == (unit, pytest.approx(step))
+    assert unit_by_steps(counts) is unit_by_steps(3.0 * rates) is unit_by_steps(rates + 0.3 * step) is None
+
+
 @pytest.mark.parametrize("grid", [1.0, 0.1, 0.125, 0.06, 0.03, 0.01, 0.0012, 0.0011, 0.001, 1 / 128, 1e-6, 9.80665 / 16384])
 @pytest.mark.parametrize("spread", [1.5, 5.0, 60.0])
 def test_other_steps_show_no_unit(grid, spread):
