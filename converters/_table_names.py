@@ -63,7 +63,9 @@ WORDS = {
     "accel": rf"accel((eration|erometer)s?)?|acc[el]?|ac|{IN_FRAMES}{UNBIASED}a|fb|g_?force|gf|linear_?acceleration"
     rf"|specific_?force|sp_?force|(linear)?beschleunigung|{UNBIASED}a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
 }
-STATES = r"_(sensor|raw|adc|counts?|(un)?cal(ib)?(rated)?|data|values?|readings?|meas(ured)?)"  # of the numbers in a column
+STATES = (  # of the numbers in a column
+    r"_(sensor|raw|deg(rees?)?|rad(ians?)?|adc|counts?|(un)?cal(ib)?(rated)?|data|values?|readings?|meas(ured)?)"
+)
 STATE = rf"(?P<state>({STATES})?)"
 PLACES = (  # of several IMUs on a body
     r"((left|right|upper|lower|l|r)_?)*(left|right|head|neck|chest|back|torso|trunk|sternum|pelvis|waist|hip|arm|forearm|wrist"

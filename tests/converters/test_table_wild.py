@@ -203,6 +203,14 @@ def test_matrices_as_matlab_writes_them_in_a_table(tmp_path):
         read(four)
 
 
+def test_a_gyro_in_degrees_is_asked_for_its_time(tmp_path):
+    """`gyr_x_deg` may be the rate or its sum."""
+    names = ["time_s", *(f"acc_{a}_mps2" for a in "xyz"), *(f"gyr_{a}_deg" for a in "xyz")]
+    path = write_csv(tmp_path / "imu.csv", names, [T_S, *(9.80665 * ACCEL_G).T, *RNG.normal(0.0, 1.0, (3, COUNT))])
+    with pytest.raises(ConfigError, match=r'gyro = \["gyr_x_deg", "gyr_y_deg", "gyr_z_deg"\]\ngyro_unit = "\?"'):
+        read(path)
+
+
 @pytest.mark.parametrize("sentence", ["VNIMU", "VNYMR", "VNQMR"])
 def test_sentences_of_a_vectornav_lack_a_time_alone(tmp_path, sentence):
     ahead = {"VNIMU": "", "VNYMR": "10.0,20.0,30.0,", "VNQMR": "0.0,0.0,0.0,1.0,"}[sentence] + "+1.1,-0.2,+0.3,"
