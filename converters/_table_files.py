@@ -14,7 +14,7 @@ from imutool.errors import DataError, required
 
 from ._archive import refusing
 from ._source import head
-from ._table_echo import of_echo
+from ._table_echo import long_table, of_echo, of_long
 from ._table_hdf5 import load_hdf5, names_of_hdf5
 from ._table_headerless import as_table, name_headerless
 from ._table_json import is_json, load_json
@@ -64,7 +64,9 @@ def kind_of(head: bytes, path: Path) -> str:
     words = "" if b"\0" in text else text_of(text)
     if is_json(words):
         return "json"
-    is_table = is_text_table(text) or (words and (as_table(words)[0] or is_mocap(words) or of_echo(words)[0]))
+    is_table = is_text_table(text) or (
+        words and (as_table(words)[0] or is_mocap(words) or of_echo(words)[0] or of_long(words)[0])
+    )
     return "csv" if is_table else ""
 
 
@@ -145,10 +147,12 @@ def read_text(text: str, columns: Columns, path: Path) -> None:
     """Add the columns of a table of text, whatever program wrote it."""
     if read_mocap(text, columns, path):
         return
-    echoed, cut = of_echo(text)
-    if table := echoed or of_vectornav(text, columns):
+    (echoed, cut), (long, few) = of_echo(text), long_table(text, path)
+    if table := echoed or long or of_vectornav(text, columns):
         read_csv(table, columns, path)
+        columns.remarks.notes.extend(["a long table: its signals became columns"] if long else [])
         columns.remarks.losses.extend([f"{cut} messages without all fields of the first are left out"] if cut else [])
+        columns.remarks.losses.extend([f"{few} times without a value of every signal are left out"] if few else [])
         return
     labelled, damaged, others = as_table(text)
     if labelled:

@@ -203,6 +203,26 @@ def test_matrices_as_matlab_writes_them_in_a_table(tmp_path):
         read(four)
 
 
+@pytest.mark.parametrize("form", ["timestamp,sensor,axis,value", "Series;Time;Value"])
+def test_a_long_table_has_its_signals_as_columns(tmp_path, form):
+    """One value is missing, and with it a sample."""
+    values = np.round(np.hstack([RNG.normal(0.0, 0.1, (COUNT, 3)), 9.80665 * ACCEL_G]), 6)
+    lines = [
+        f"{t:.2f},{sensor},{axis},{value}" if "," in form else f"{sensor}{axis};{t:.2f};{value}"
+        for t, row in zip(T_S.tolist(), values.tolist(), strict=True)
+        for (sensor, axis), value in zip([(s, a) for s in ("gyro", "accel") for a in "xyz"], row, strict=True)
+    ]
+    del lines[6 * 50 + 4]
+    (tmp_path / "long.csv").write_text("\n".join([form, *lines]) + "\n")
+    (sequence,) = table.sequences(tmp_path / "long.csv")
+    log = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s", "accel_unit": "m/s^2", "time_unit": "s"})
+    np.testing.assert_array_equal(log.imus["/imu0"].gyro, np.delete(values[:, :3], 50, axis=0))
+    assert log.remarks.losses == ["1 times without a value of every signal are left out"]
+    (tmp_path / "twice.csv").write_text("\n".join([form, *lines, *lines[:6]]) + "\n")
+    with pytest.raises(DataError, match=r"long table whose signals .* have two at one\. Pivot it"):
+        read(tmp_path / "twice.csv")
+
+
 def test_a_gyro_in_degrees_is_asked_for_its_time(tmp_path):
     """`gyr_x_deg` may be the rate or its sum."""
     names = ["time_s", *(f"acc_{a}_mps2" for a in "xyz"), *(f"gyr_{a}_deg" for a in "xyz")]
