@@ -215,13 +215,15 @@ def ros1_topic(name: str, kind: str, definition: str) -> MessageTopic:
 
 
 def same_layout(ours: Mapping[str, Any], our_kind: str, theirs: Mapping[str, Any], their_kind: str) -> bool:
-    """Whether two definitions lay out a message in the same bytes."""
+    """Whether two definitions lay out a message in the same bytes, and name its fields alike."""
     if our_kind == HEADER == their_kind:
         return True
     if our_kind not in ours or their_kind not in theirs:
         return False
     mine, other = ours[our_kind][1], theirs[their_kind][1]
-    return len(mine) == len(other) and all(_same_field(ours, a, theirs, b) for (_, a), (_, b) in zip(mine, other, strict=True))
+    if [name for name, _ in mine] != [name for name, _ in other]:
+        return False
+    return all(_same_field(ours, a, theirs, b) for (_, a), (_, b) in zip(mine, other, strict=True))
 
 
 def _same_field(ours: Mapping[str, Any], mine: Any, theirs: Mapping[str, Any], other: Any) -> bool:

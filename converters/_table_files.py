@@ -14,7 +14,7 @@ from imutool.errors import DataError, required
 
 from ._archive import refusing
 from ._source import head
-from ._table_echo import of_echo
+from ._table_echo import long_table, of_echo, of_long
 from ._table_hdf5 import load_hdf5, names_of_hdf5
 from ._table_headerless import as_table, name_headerless
 from ._table_json import is_json, load_json
@@ -22,7 +22,7 @@ from ._table_mat import check_size, load_mat, names_of_mat
 from ._table_merged import join_stamps, sort_by_clock
 from ._table_mocap import is_mocap, read_mocap
 from ._table_motion import add_gravity
-from ._table_names import group_of, leaf_of, tells_apart
+from ._table_names import TIME_WORDS, group_of, leaf_of, split_name, tells_apart
 from ._table_numbers import is_number
 from ._table_packed import goes_back, read_bytes, text_head
 from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated, state_mip
@@ -64,7 +64,9 @@ def kind_of(head: bytes, path: Path) -> str:
     words = "" if b"\0" in text else text_of(text)
     if is_json(words):
         return "json"
-    is_table = is_text_table(text) or (words and (as_table(words)[0] or is_mocap(words) or of_echo(words)[0]))
+    is_table = is_text_table(text) or (
+        words and (as_table(words)[0] or is_mocap(words) or of_echo(words)[0] or of_long(words)[0])
+    )
     return "csv" if is_table else ""
 
 
@@ -101,7 +103,19 @@ def may_hold_several(path: Path) -> bool:
     in_groups = kind in OF_GROUPS and len({*map(group_of, names)} | {""}) > 2
     if kind in ("json", "sheets") or in_groups or any(tells_apart(leaf_of(name)) for name in names):
         return True
-    return kind == "csv" and goes_back(path)
+    return goes_back(path) if kind == "csv" else kind == "parquet" and _times_fall(path, names)
+
+
+def _times_fall(path: Path, names: list[str]) -> bool:
+    """Whether a time of a Parquet file goes back."""
+    times = [name for name in names if re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(name)[0])]
+    with refusing(path):
+        for column in _module("pyarrow.parquet", path).read_table(path, columns=times).columns if times else ():
+            if re.match(NUMBERS, str(column.type)) and column.null_count == 0:
+                values = column.to_numpy()
+                if (np.diff(values.astype(np.int64 if values.dtype.kind == "M" else float)) < 0).any():
+                    return True
+    return False
 
 
 def _names_of(path: Path, kind: str) -> list[str]:
@@ -133,10 +147,12 @@ def read_text(text: str, columns: Columns, path: Path) -> None:
     """Add the columns of a table of text, whatever program wrote it."""
     if read_mocap(text, columns, path):
         return
-    echoed, cut = of_echo(text)
-    if table := echoed or of_vectornav(text, columns):
+    (echoed, cut), (long, few) = of_echo(text), long_table(text, path)
+    if table := echoed or long or of_vectornav(text, columns):
         read_csv(table, columns, path)
+        columns.remarks.notes.extend(["a long table: its signals became columns"] if long else [])
         columns.remarks.losses.extend([f"{cut} messages without all fields of the first are left out"] if cut else [])
+        columns.remarks.losses.extend([f"{few} times without a value of every signal are left out"] if few else [])
         return
     labelled, damaged, others = as_table(text)
     if labelled:

@@ -97,11 +97,13 @@ def _sequences_in(folder: Path) -> list[Sequence]:
         return [Sequence(folder.name, folder / DATA_FILE)]
     found = {} if is_phone(folder) or logs_in(folder) else _recordings(folder)
     used = {path for tables in found.values() for path in tables}
-    others = {path: kind_of(head(path), path) for path in _tables(folder) if path.is_file() and path not in used}
+    others = {
+        path: kind_of(head(path), path) for path in (_stems(folder) if found else ()) if path.is_file() and path not in used
+    }
     shown = (
         kind in ("csv", "") or (kind != "json" and (look(path).header or look(path).has_time)) for path, kind in others.items()
     )
-    left = [path.name for path, is_table in zip(others, shown, strict=True) if is_table]
+    left = [path.relative_to(folder).as_posix() for path, is_table in zip(others, shown, strict=True) if is_table]
     if found and left:  # settings in JSON are none, and damaged ones are told of
         logger.warning("%s: tables that show no IMU are left out: %s", folder, _listed(left))
     places = {name: (next(iter(tables)), "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}

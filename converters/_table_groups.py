@@ -16,12 +16,12 @@ from ._table_pose_names import (
     NUMBERS,
     POSITIONS,
     QUATERNION,
-    QUATERNION_ARRAY,
     angles_of,
     axes_of,
     bodies_of,
     from_north,
     matrix_of,
+    numbered_quaternion,
     pose_leaves,
     position_of,
 )
@@ -188,7 +188,7 @@ def _turns(columns: Columns, entries: Entries, leaves: dict[str, str], clock: tu
     arrays = {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
     q = [arrays[axis] for axis in "wxyz"] if len(arrays) == 4 else axes_of(QUATERNION, leaves, "wxyz")
     nine = matrix_of(leaves)
-    if not q and not nine and (four := axes_of(QUATERNION_ARRAY, leaves, "0123")):
+    if not q and not nine and (four := numbered_quaternion(leaves)):
         q, order = order_by_motion(columns, entries, four, clock)
         if q:
             reasons.append(f"{', '.join(four)} turn as the gyro does in the order {order}")
@@ -214,7 +214,7 @@ def _said_apart(columns: Columns, clock: tuple[str, str], own: tuple[str, str]) 
 def _why_no_turns(columns: Columns, leaves: dict[str, str], bodies: list[dict[str, str]], apart: str) -> list[str]:
     """Reasons why the rotations of a group make no poses."""
     array = next((c[:-3] for c in leaves.values() if c.endswith("[3]") and f"{c[:-3]}[4]" not in columns.values), "")
-    named = [array] if array else next(filter(None, (axes_of(QUATERNION_ARRAY, body, "0123") for body in bodies)), [])
+    named = [array] if array else next(filter(None, map(numbered_quaternion, bodies)), [])
     if named:
         return [f"{', '.join(named)} has four columns of no certain order; `quaternion_wxyz` of a map makes poses of them"]
     if nine := matrix_of(leaves):

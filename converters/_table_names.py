@@ -54,13 +54,18 @@ ESTIMATED = r"(^|_)(est|estimated|filt|filtered|smoothed|fused|rotated|world|ear
 CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration` of Apple's CoreMotion
 WHOLE_WORDS = "gyr|acc|time"  # that begin behind capitals
 DIGITS = str.maketrans("012", "xyz")
+UNBIASED = r"(?<!(?<![a-z0-9])b_)"  # b_g is a bias, and so is b_w_RS_S of EuRoC
+BIAS = r"(^|_)bias(es)?_(?!corr|comp|free|remov)"  # in front of the name of a sensor
+IN_FRAMES = r"(?<![pqrv]_[a-z]{2}_)"  # p_WS_W is a position, in a frame W
 WORDS = {
-    "gyro": r"gyro(scope)?s?|gyro_?rotation|gyroskop|gyr|gy|omega|w|(?<![pqrvc]_)wb|g|angular_?velocity|ang_?vel"
-    r"|(rotation_?)?rate|rate_of_rotation|w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?|gyro_?adc|gyro_rad",
-    "accel": r"accel((eration|erometer)s?)?|acc[el]?|ac|(?<![pr]_[a-z]{2}_)a|fb|g_?force|gf|linear_?acceleration"
-    r"|specific_?force|sp_?force|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
+    "gyro": rf"gyro(scope)?s?|gyro_?rotation|gyroskop|gyr|gy|omega|{IN_FRAMES}w|(?<![pqrvc]_)wb|{UNBIASED}g"
+    rf"|angular_?velocity|ang_?vel|(rotation_?)?rate|rate_of_rotation|{UNBIASED}w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?|gyro_?adc|gyro_rad",
+    "accel": rf"accel((eration|erometer)s?)?|acc[el]?|ac|{IN_FRAMES}{UNBIASED}a|fb|g_?force|gf|linear_?acceleration"
+    rf"|specific_?force|sp_?force|(linear)?beschleunigung|{UNBIASED}a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
 }
-STATES = r"_(sensor|raw|adc|counts?|(un)?cal(ib)?(rated)?|data|values?|readings?|meas(ured)?)"  # of the numbers in a column
+STATES = (  # of the numbers in a column
+    r"_(sensor|raw|deg(rees?)?|rad(ians?)?|adc|counts?|(un)?cal(ib)?(rated)?|data|values?|readings?|meas(ured)?)"
+)
 STATE = rf"(?P<state>({STATES})?)"
 PLACES = (  # of several IMUs on a body
     r"((left|right|upper|lower|l|r)_?)*(left|right|head|neck|chest|back|torso|trunk|sternum|pelvis|waist|hip|arm|forearm|wrist"
@@ -75,6 +80,7 @@ FORMS = (  # names of an axis, by falling preference; one of roll, pitch and yaw
     rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[xyz])_?(?P<place>\d|{PLACES}|(imu|sensor)_?\d?){STATE}",  # ax1, acc_x_chest
     rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<place>\d|{PLACES})_?(?P<axis>[xyz]){STATE}",  # acc1_x, acc_chest_x
     rf"(?P<sensor>(?:.*_)?(WORDS))(?P<state>{STATES})_?(?P<axis>[xyz012])",  # acc_raw_x
+    rf"(?P<sensor>(?:.*_)?(?=[a-z]{{2}})(WORDS)){STATE}_(?P<nth>[1-9])",  # acc_1, as MATLAB names the columns of a matrix
 )
 SYMBOLS = {  # of an aircraft; specific force, or in the axes of the body, where gravity shows that it is no bias
     "gyro": r"(?P<sensor>)(?P<axis>[pqr])",
@@ -114,11 +120,12 @@ def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[st
     groups: dict[tuple[str, str], dict[str, str]] = {}
     axes = TURNS if sensor == "gyro" else AXES
     for column, name in names.items():
-        if match := re.fullmatch(form.replace("WORDS", WORDS[sensor]), name):
+        if (match := re.fullmatch(form.replace("WORDS", WORDS[sensor]), name)) and not re.search(BIAS, name):
             found = match.groupdict()
             owner = f"{re.sub(r'^(?=[0-9])', 'imu', found['place'])}_" if "place" in found else found.get("of", "")
             group = groups.setdefault((owner + found["sensor"], found.get("state", "")), {})
-            group[axes.get(found["axis"], found["axis"])] = column
+            axis = found["axis"] if "axis" in found else "xyz456789"[int(found["nth"]) - 1]
+            group[axes.get(axis, axis)] = column
     whole = {key: group for key, group in groups.items() if set(group) == set("xyz")}
     whole = {(name, state): group for (name, state), group in whole.items() if not state or (name, "") not in whole}
     owners = [re.sub(rf"(^|_)({WORDS[sensor]})$", "", name) for name, _ in whole]

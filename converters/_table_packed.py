@@ -108,10 +108,12 @@ def read_bytes(path: Path) -> bytes:
     return b"".join(parts)
 
 
-def goes_back(path: Path) -> bool:
-    """Whether lines from all over a plain text hold a column that rises, and falls a few times."""
+def _sampled(path: Path) -> list[bytes]:
+    """Lines from all over a text; of one that is packed or in UTF-16 all is read for them."""
     if opener(head(path)) is not None or head(path).startswith(UTF16):
-        return False
+        text = read_bytes(path)
+        lines = (text.decode("utf-16", "replace").encode() if text.startswith(UTF16) else text).splitlines()
+        return [line.strip() for line in lines[:: max(len(lines) // SAMPLED, 1)]]
     lines = []
     with refusing(path), path.open("rb") as file:
         size = path.stat().st_size
@@ -119,6 +121,16 @@ def goes_back(path: Path) -> bool:
             file.seek(start)
             file.readline(LONGEST_LINE)  # the rest of a line
             lines.append(file.readline(LONGEST_LINE).strip())
+    return lines
+
+
+def goes_back(path: Path) -> bool:
+    """Whether lines from all over a text hold a column that rises, and falls a few times.
+
+    Raises:
+        DataError: it cannot be unpacked.
+    """
+    lines = _sampled(path)
     rows = [re.split(rb"[;,\t ]+", line) for line in lines if line]
     width = max(Counter(map(len, rows)).items(), key=lambda each: each[1], default=(0, 0))[0]
     for column in zip(*(row for row in rows if len(row) == width), strict=True):

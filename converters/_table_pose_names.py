@@ -12,7 +12,7 @@ from ._table_text import Columns
 FRAMES = r"(_[a-z]{2})?"  # of a rotation or a position, as in q_wb, R_wb, p_wb
 ROTATION = rf"(q|quat|quaternion|orientation|rotation|attitude|ori|rot){FRAMES}_?"
 QUATERNION = rf"{ROTATION}(?P<axis>[wxyz])"
-QUATERNION_ARRAY = rf"(.*_)?{ROTATION}(?P<axis>[0-3])"
+QUATERNION_ARRAY = rf"(.*_)?{ROTATION}(?P<axis>[0-4])"  # from 0, or as MATLAB counts
 COMMANDED = r"(.*_)?(des|desired|sp|set_?point|cmd|command|target|ref|reference|demand|err|error)_"
 ANGLES = (
     (rf"(?!{COMMANDED})(.*_)?(?P<axis>roll|pitch|yaw)(_?angle)?(_?(deg|rad)[a-z]*)?", ("roll", "pitch", "yaw")),
@@ -77,9 +77,14 @@ def why_no_poses(columns: Columns, group: str) -> str:
     return f"{said}; a map names its columns (truth_time, position, quaternion_wxyz or another rotation)"
 
 
+def numbered_quaternion(leaves: dict[str, str]) -> list[str]:
+    """Columns of a quaternion that are numbered, in an order that its name does not show."""
+    return axes_of(QUATERNION_ARRAY, leaves, "0123") or axes_of(QUATERNION_ARRAY, leaves, "1234")
+
+
 def has_turns(leaves: dict[str, str]) -> bool:
     """Whether there are quaternions, matrices or angles."""
-    quaternion = axes_of(QUATERNION, leaves, "wxyz") or axes_of(QUATERNION_ARRAY, leaves, "0123")
+    quaternion = axes_of(QUATERNION, leaves, "wxyz") or numbered_quaternion(leaves)
     return bool(quaternion or matrix_of(leaves) or angles_of(leaves))
 
 

@@ -195,7 +195,9 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
         raise DataError("has a line of more than 65 536 characters", where=path, expected="a table of text")
     delimiter = _delimiter(lines, least)
     first = next((n for n, line in enumerate(lines) if _is_row(line, delimiter, least)), len(lines))
-    several = (part for line in lines[:first] if line.startswith(COMMENTS) for part in re.split(r", |: (?=.*=)", line))
+    several = (
+        part for line in lines[:first] if line.startswith(COMMENTS) for part in re.split(r", |: (?=.*=)| (?=\w+=\S)", line)
+    )
     stated = filter(None, map(STATED_NUMBER.fullmatch, [*lines[:first], *several]))
     columns.numbers |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in stated}
     above = {line.strip(AROUND) for line in lines[:first]}

@@ -43,7 +43,6 @@ from imutool.recording import seconds
 
 SUFFIX, CLEAN_RECORD = "/debiased", "imutool_clean"
 DEBIASED_BY = "debiased_by"  # in the record `imutool`: the log's own IMU is a debiased one, from `imutool.debias` of arrays
-
 logger = logging.getLogger(__name__)
 
 
@@ -239,8 +238,10 @@ def _debias(
     given = dict(options.model) if isinstance(options.model, Mapping) else {} if options.model is None else {"": options.model}
     topics = model_choice.choose_imus(log, options.imus, given)
     check_new_topics(log, {topic: new_topics(topic) for topic in topics})
-    if (by := log.metadata().get("imutool", {}).get(DEBIASED_BY)) and not options.force:
-        raise LogError(f"its IMU is debiased already, by {by}", where=source, fix="Start from the raw log, or set `force`")
+    done = [f"by {by}" for by in [log.metadata().get("imutool", {}).get(DEBIASED_BY)] if by]
+    done += [f"as {topic}" for topic in topics if topic in log.topics and log.topics[topic].is_derived]
+    if done and not options.force:
+        raise LogError(f"its IMU is debiased already, {done[0]}", where=source, fix="Start from the raw log, or set `force`")
     log.keep(topics)
     surveys = {} if options.clean is None else {topic: look(log, topic, options.clean).trusted() for topic in topics}
     derived, starts, models, records, fits = [], {}, {}, {}, {}
@@ -260,13 +261,11 @@ def _debias(
         def metadata(verified: Verified) -> Values:
             origin = {"source_file": source.name, "source_size": str(source.stat().st_size), **digest.result()}
             origin["verified"] = json.dumps(verified._asdict())
-            entries = {
-                _record_name("imutool", topic, records): v | origin | sieves[topic].record() for topic, v in records.items()
-            }
+            entries = {_record_name("imutool", t, records): v | origin | sieves[t].record() for t, v in records.items()}
             return entries | {_record_name(CLEAN_RECORD, topic, records): found.record() for topic, found in surveys.items()}
 
-        chosen_ways = {"overwrite": options.overwrite, "own_encoding": options.encoding == "own"}
-        report = rewrite(log, target, derived, metadata=metadata, check=options.check, progress=progress, **chosen_ways)
+        ways = {"overwrite": options.overwrite, "own_encoding": options.encoding == "own", "check": options.check}
+        report = rewrite(log, target, derived, metadata=metadata, progress=progress, **ways)
     for topic, sieve in sieves.items():
         for text in sieve.warnings():
             logger.warning("%s %s: %s", source, topic, text)

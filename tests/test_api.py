@@ -346,6 +346,9 @@ def test_samples_in_g_are_warned_of_one_by_one_and_give_no_bias_at_rest(logs: Pa
     assert caplog.text.count("the specific force has a median of 1.0") == 1
     with pytest.raises(imutool.DataError, match="the specific force has a median of 1"):
         imutool.bias_at_rest(model, in_g)
+    with pytest.raises(imutool.DataError, match="imu: the samples do not begin at rest") as refused:
+        imutool.bias_at_rest(model, imu.rows(slice(0, 50)))
+    assert "init" not in str(refused.value)
 
 
 @pytest.mark.parametrize("set_back_ns", [0, 20_000_000_000])
@@ -382,6 +385,8 @@ def test_a_channel_that_is_debiased_already_is_named(tmp_path: Path, caplog: pyt
     channel = imutool.read(tmp_path / "out.mcap", imu="/imu0/debiased")
     with pytest.raises(imutool.DataError, match="debiased already, by static"):
         imutool.debias(channel, "static")
+    with pytest.raises(imutool.LogError, match="debiased already, as /imu0/debiased"):
+        imutool.debias(tmp_path / "out.mcap", tmp_path / "twice.mcap", model="static", imus=["/imu0/debiased"])
     imutool.evaluate(tmp_path / "out.mcap")
     assert caplog.messages == []
     imutool.evaluate(channel, models=["static"])
@@ -594,7 +599,8 @@ def test_arrays_are_trained_on_scored_and_diagnosed_as_their_logs_are(logs: Path
 def test_a_diagnosis_of_arrays_names_them_and_no_file_that_is_gone(tmp_path: Path) -> None:
     """Arrays are a temporary log while they are diagnosed; its path stood in findings.json and on the page."""
     real = replace(imutool.example_recording(7, duration_s=10.0), name="Halle 3/links")
-    found = imutool.diagnose([real, real], imutool.example_recording(7, duration_s=10.0), output=tmp_path / "found")
+    other = replace(real, imu=real.imu.rows(slice(1, None)))
+    found = imutool.diagnose([real, other], imutool.example_recording(7, duration_s=10.0), output=tmp_path / "found")
     assert (found.report.real, found.report.sim) == (("Halle 3_links", "Halle 3_links (2)"), "flight_7")
     written = [path.read_bytes().decode(errors="ignore") for path in sorted((tmp_path / "found").iterdir())]
     assert len(written) >= 5

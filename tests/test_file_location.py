@@ -301,6 +301,8 @@ def test_a_log_that_is_given_twice_is_refused(imutool: Any, tmp_path: Path, logs
     run = api.diagnose if words == ["diagnose"] else partial(api.train, out=tmp_path / "m.safetensors")
     with pytest.raises(ConfigError, match="is given twice"):
         run([tmp_path / "a.mcap", str(tmp_path / "a.mcap")])
+    with pytest.raises(ConfigError, match="are given twice"):
+        run([api.read(tmp_path / "a.mcap"), api.read(tmp_path / "a.mcap")])
 
 
 def test_a_file_is_asked_for_once_to_find_logs_that_are_given_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -430,11 +432,18 @@ def test_without_credentials_an_output_is_refused_with_a_message(
 
 
 def test_a_command_that_takes_files_alone_says_so_of_a_url(imutool: Any, tmp_path: Path, logs: Path) -> None:
-    refused = imutool("view", "s3://fleet/in.mcap", "--html", "page.html", cwd=tmp_path)
+    refused = imutool("evaluate", "s3://fleet/in.mcap", cwd=tmp_path)
     assert refused.returncode == ConfigError.exit_code
     assert "s3://fleet/in.mcap: is in an object store" in " ".join(refused.stderr.split())
     taken = imutool("clean", f"file://{logs / 'flight_1.mcap'}", f"file://{tmp_path / 'out.mcap'}", cwd=tmp_path)
     assert (taken.returncode, (tmp_path / "out.mcap").is_file()) == (0, True), taken.stderr
+
+
+@pytest.mark.parametrize("words", [["view", "memory://a/b.mcap"], ["diagnose", "r.mcap", "--sim", "memory://a/b.mcap"]])
+def test_what_is_looked_at_may_be_in_a_store(imutool: Any, tmp_path: Path, logs: Path, words: list[str]) -> None:
+    (tmp_path / "r.mcap").write_bytes((logs / "flight_1.mcap").read_bytes())
+    refused = imutool(*words, cwd=tmp_path)
+    assert "memory://a/b.mcap: cannot be opened (no such object" in " ".join(refused.stderr.split())
 
 
 def test_an_object_that_changes_while_it_is_read_is_said(store: Any, flight: bytes) -> None:

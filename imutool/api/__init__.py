@@ -101,11 +101,15 @@ def given_logs(
     from imutool.mcap_io.write import write
     from imutool.recording import Recording
 
-    places, names = list[Location](), dict[str, str]()
+    places, names, written = list[Location](), dict[str, str](), set[int]()
     with ExitStack() as folders:
         for log in several(logs):
             if isinstance(log, Recording):
                 log.imu.check_rate(log.name)
+                samples = hash((log.imu.t_ns.tobytes(), log.imu.gyro.tobytes(), log.imu.accel.tobytes()))
+                if samples in written:
+                    raise ConfigError(f"the samples of {log.name} are given twice", where=parameter, expected="each log once")
+                written.add(samples)
                 folder = folders.enter_context(TemporaryDirectory(prefix="imutool-"))
                 name = _distinct(_file_name(log.name) or parameter, {*names.values()})
                 places.append(Path(folder) / f"{name}.mcap")

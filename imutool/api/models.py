@@ -90,7 +90,10 @@ def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     imu.check_rate("imu")
     if wrong := unusual_gravity(imu.accel) if len(imu) else "":
         raise DataError(wrong, where="imu", expected="samples in rad/s and m/s²")
-    return find_initial_bias("stationary", model, Recording("imu", imu))
+    try:
+        return find_initial_bias("stationary", model, Recording("imu", imu))
+    except DataError as error:  # of a log
+        raise error.replaced(what="the samples do not begin at rest", where="imu", fix="") from None
 
 
 @dataclass(frozen=True, eq=False, repr=False)

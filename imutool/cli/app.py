@@ -196,6 +196,7 @@ app = App(
 )
 
 Logs = Annotated[list[Path], typer.Argument(metavar="LOG", help="MCAP logs.")]
+LogUrls = Annotated[list[str], typer.Argument(metavar="LOG", help="MCAP logs: files or URLs such as s3://bucket/log.mcap.")]
 Models = Annotated[list[str] | None, typer.Option("--model", help="Model file, a name that ships, or 'static'. Repeatable.")]
 Init = Annotated[str, typer.Option(help="Initial bias: auto, stationary, prior, truth, or gx,gy,gz,ax,ay,az (rad/s, m/s²).")]
 Smooth = Annotated[bool, typer.Option("--smooth", help="Use the whole log for each sample's bias: more accurate, not causal.")]
@@ -284,11 +285,10 @@ def _forget_stdout() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _version(show: bool) -> bool:
+def _version(show: bool) -> None:
     if show:
         say(f"imutool {__version__}")
         raise typer.Exit
-    return show
 
 
 @app.callback()

@@ -26,7 +26,7 @@ Folder = Annotated[
     FOLDER,
 ]
 Sim = Annotated[
-    Path | None,
+    str | None,
     typer.Option(metavar="SIM", help="Simulation, of any motion if both have poses; by default along the recording's poses."),
 ]
 Close = Annotated[
@@ -41,7 +41,8 @@ Metric = Annotated[
 @app.command(epilog="Example: [bold]imutool diagnose real.mcap --sim sim.mcap -o diagnosis[/]")
 def diagnose(
     reals: Annotated[
-        list[Path], typer.Argument(metavar="REAL", help="Recordings; several share the physics, each has its own bias.")
+        list[str],
+        typer.Argument(metavar="REAL", help="Recordings, files or URLs; several share the physics, each has its own bias."),
     ],
     sim: Sim = None,
     signal: Annotated[
@@ -67,22 +68,23 @@ def diagnose(
     from imutool.config import load as load_settings
     from imutool.diagnosis.closed_loop import script_metric
     from imutool.diagnosis.settings import DiagnoseSettings
-    from imutool.file_location import refuse_twins
+    from imutool.file_location import local, refuse_twins, to_location
     from imutool.processes.forked import forking
 
-    refuse_twins(reals, "reals")
+    logs = [to_location(real) for real in reals]
+    refuse_twins(logs, "reals")
     settings = load_settings(DiagnoseSettings, config, set_ or ())
     with forking(), common.progress("Diagnosing") as tell:
         diagnosis, remarks = diagnosis_output.diagnose(
-            reals,
-            sim,
+            logs,
+            None if sim is None else to_location(sim),
             folder,
             imu=imu,
             truth=truth,
             signals=signal or (),
             settings=settings,
             close=close,
-            metric=None if metric is None else script_metric(metric, reals[0]),
+            metric=None if metric is None else script_metric(metric, local(logs[0], "metric")),
             overwrite=common.overwrite,
             tell=tell,
         )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from msgspec.structs import replace
 
-from imutool.cli.app import COMMON, PNG, TOML, Common, MaxChunk, app
+from imutool.cli.app import COMMON, PNG, TOML, Common, LogUrls, MaxChunk, app
 from imutool.cli.terminal import say, table, tell_losses
 from imutool.errors import LOST, ConfigError
 from imutool.file_location import to_location
@@ -27,7 +27,7 @@ EARLIEST_DATE_NS = 365 * 86400 * 10**9  # of 1971: an earlier first stamp counts
 
 @app.command(epilog="Example: [bold]imutool info MH_04.mcap[/] or [bold]imutool info still.mcap --noise --noise-toml i.toml[/]")
 def info(
-    logs: Annotated[list[str], typer.Argument(metavar="LOG", help="MCAP logs: files, or URLs such as s3://bucket/log.mcap.")],
+    logs: LogUrls,
     noise: Annotated[bool, typer.Option("--noise", help="Identify the IMU's noise, at rest and against the truth.")] = False,
     model: Annotated[str | None, typer.Option(help="For --noise: model that corrects the samples in motion.")] = None,
     imu: Annotated[str | None, typer.Option(help="For --noise: IMU topic, where a log has several.")] = None,

@@ -9,8 +9,9 @@ from typing import Annotated
 
 import typer
 
-from imutool.cli.app import COMMON, HTML, Aid, Common, Imu, Init, Logs, Models, Smooth, Truth, Written, app
+from imutool.cli.app import COMMON, HTML, Aid, Common, Imu, Init, LogUrls, Models, Smooth, Truth, Written, app
 from imutool.cli.terminal import say
+from imutool.file_location import to_location
 from imutool.mcap_io.storage import output_conflicts
 from imutool.report import Report
 from imutool.viewing import Output
@@ -36,7 +37,7 @@ class View(Report, frozen=True, tag="imutool.view/1"):
 
 @app.command(epilog="Example: [bold]imutool view MH_04_debiased.mcap --save MH_04.rrd[/]")
 def view(
-    logs: Logs,
+    logs: LogUrls,
     model: Models = None,
     init: Init = "auto",
     smooth: Smooth = False,
@@ -69,18 +70,18 @@ def view(
     from imutool.viewing.model.trajectory_error import alignment
     from imutool.viewing.outputs import Outputs, RequestedOutputs
 
-    aligned = alignment(align)
+    aligned, places = alignment(align), [to_location(log) for log in logs]
     read = partial(load, models=model or (), init=init, smooth=smooth, imu=imu, truth=truth, aid=aid)
     read = partial(read, align=aligned, findings=findings)
     asked = RequestedOutputs(save, connect, web, port, export_web, png, html, at, source, common.overwrite)
     with Outputs(asked) as outputs:
         with common.progress("Reading") as tell:
             data = []
-            for done, log in enumerate(logs):
-                tell(done, len(logs), log.name)
+            for done, log in enumerate(places):
+                tell(done, len(places), log.name)
                 data.append(read(log))
         shown = outputs.show(data)
-        report = View([str(log) for log in logs], shown, **outputs.versions())
+        report = View([str(log) for log in places], shown, **outputs.versions())
         if not common.write(report):
             for output in shown:
                 say(output.said)

@@ -64,7 +64,7 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "it is a pickle of Python, which can run any program when it is read",
         "Load it where you trust its source, save the arrays with numpy.savez, and convert that",
     ),
-    rb"(#[^\n]*\n)*([^\n]*[,;\t])?['\"]?(?i:_?value)['\"]?\s*[,;\t\n]": (  # as InfluxDB and Grafana export
+    rb"(#[^\n]*\n)*(?=([^\n]*[,;\t]){2})([^\n]*[,;\t])?['\"]?(?i:_?value)['\"]?\s*[,;\t\n]": (  # as InfluxDB and Grafana export
         "it is a long table, with a row for each number",
         "Pivot it to a row for each time and a column for each axis, as pivot() of Flux and pivot_table() of pandas do",
     ),

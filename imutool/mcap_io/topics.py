@@ -164,11 +164,7 @@ def _named(batch: Rows | ImuBatch, row: int) -> str:
 
 
 def check_finite(batch: Rows | ImuBatch, fix: str = CUT, **fields: Float64[np.ndarray, "n _"]) -> None:
-    """Refuses NaN and infinity, naming the message.
-
-    Raises:
-        LogError: a value that is not finite.
-    """
+    """Refuses NaN and infinity, naming the message (LogError)."""
     for name, values in fields.items():
         if not (good := np.isfinite(values).all(axis=1)).all():
             row = int(np.argmin(good))
@@ -263,15 +259,19 @@ def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callab
             continue
         if message is not None:
             found[name] = _as_ros(topic, message)
-    if any(topic.schema_name == schemas.IMU and not topic.is_derived for topic in (*found.values(), *topics.values())):
-        return found
+    imus = {name: topic for name, topic in {**topics, **found}.items() if topic.schema_name == schemas.IMU}
+    own = {name: definition for name, topic in imus.items() if (definition := definitions[name]) and not topic.reflected}
+    odd = {name for name, definition in own.items() if not ros2_definition.is_imu_of_ros(definition.data)}
+    known = any(not topic.is_derived for name, topic in imus.items() if name not in odd)
     for name, topic in topics.items():
-        described = (topic.schema_encoding, topic.message_encoding) == ("ros2msg", "cdr") and not topic.is_derived
-        definition = definitions[name] if described else None
+        described = (topic.schema_encoding, topic.message_encoding, topic.is_derived) == ("ros2msg", "cdr", False)
+        definition = definitions[name] if described and (name in odd or not known) else None
         if definition is not None and (imu := reflect_cdr(topic.schema_name, definition.data)) is not None:
             texts = {index.schemas[c.schema_id].data for c in index.channels.values() if c.topic == name and c.schema_id}
             ros2_definition.refuse_two(name, topic.schema_name, [ros2_definition.parse(topic.schema_name, t) for t in texts])
             found[name] = _as_ros(topic, imu)
+        elif name in odd:  # whose bytes would be read in the order of ROS
+            found[name] = replace(topic, schema_name=f"{topic.schema_name} (another definition)")
     return found
 
 

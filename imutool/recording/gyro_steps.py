@@ -30,6 +30,12 @@ LEAST_SUM = 25.0  # of Rayleigh's statistic on three axes: by chance it is large
 MOST_OFF, MOST_UNCERTAIN = 0.005, 0.003  # share by which the grid's true step differs, and its standard deviation
 LEAST_NEXT = 0.1  # share of neighbours that are one step apart: else the true step is larger
 ROUNDED = 1e-5  # of a step: rounding moves a value by less
+MOST_COUNTS = 2.0**16  # of a register
+LEAST_WHOLE, WHOLE_OFF, WHOLE_ROWS = (
+    200,
+    0.1,
+    10_000,
+)  # different counts of all values, what each may be off, rows that are taken
 
 
 def unit_by_steps(rates: Float64[np.ndarray, "n 3"]) -> tuple[str, float] | None:
@@ -38,7 +44,17 @@ def unit_by_steps(rates: Float64[np.ndarray, "n 3"]) -> tuple[str, float] | None
     ordered = [np.sort(axis[np.isfinite(axis)]) for axis in rates.T]
     likely = _likely(ordered, np.array([step for _, step in STEPS]))
     found = [(unit, step) for (unit, step), worth in zip(STEPS, likely, strict=True) if worth and _counts_in(ordered, step)]
+    found = found or [(unit, step) for unit, step in STEPS if _are_whole(rates[:: max(1, len(rates) // WHOLE_ROWS)], step)]
     return found[0] if len({unit for unit, _ in found}) == 1 else None
+
+
+def _are_whole(rates: Float64[np.ndarray, "n 3"], step: float) -> bool:
+    """Whether all values are whole numbers of a step and of no multiple, as of a motion with few values near the median."""
+    counts = rates[np.isfinite(rates)] / step
+    whole = np.unique(counts.round())
+    if len(whole) < LEAST_WHOLE or np.abs(counts - counts.round()).max() > WHOLE_OFF:
+        return False
+    return bool(np.abs(whole).max() < MOST_COUNTS and np.gcd.reduce(whole.astype(np.int64)) == 1)
 
 
 def _likely(ordered: Sequence[Float64[np.ndarray, " _"]], steps: Float64[np.ndarray, " m"]) -> Iterator[bool]:

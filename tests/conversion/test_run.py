@@ -362,6 +362,7 @@ def test_converting_needs_no_torch():
         (b"Series;Time;Value\ngx;2024-05-01 12:00:00;0.1\n", r"long table.*Pivot"),
         (b"timestamp,sensor,axis,value\n0.0,gyro,x,0.1\n", r"long table.*Pivot"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:5f5b\nsize 42586\n", "pointer of Git LFS.*git lfs pull"),
+        (b'"property","value"\n"version","1.1.13"\n', "no sequence found; expected a ROS bag"),  # of phyphox
         (b"neither one nor the other", "no sequence found; expected a ROS bag"),
     ],
 )

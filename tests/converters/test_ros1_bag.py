@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imutool.converters import ros1_bag
+from imutool.converters._ros_types import Ros1Types
 from imutool.mcap_io.read import read
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
@@ -101,6 +103,14 @@ def write_bag(path: Path, *, compression: Writer.CompressionFormat | None = None
                 arrival = t_ns - 500_000_000 if topic.startswith("/camera") else t_ns
                 bag.write(connections[topic], arrival, STORE.serialize_ros1(message, message.__msgtype__))
     return path
+
+
+def test_a_definition_with_the_fields_of_ros_in_another_order_keeps_its_names() -> None:
+    text = STORE.generate_msgdef("sensor_msgs/msg/Imu", ros_version=1)[0]
+    other = {"angular_velocity": "linear_acceleration", "linear_acceleration": "angular_velocity"}
+    text = re.sub("|".join(other), lambda found: other[found[0]], text)
+    topic, _ = Ros1Types().topic("/imu", "sensor_msgs/Imu", text)
+    assert topic.schema.index(b"linear_acceleration") < topic.schema.index(b"angular_velocity")
 
 
 def values(message: Any) -> list[Any]:

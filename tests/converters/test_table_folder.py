@@ -554,6 +554,19 @@ def test_tables_of_a_folder_that_show_no_imu_are_named(tmp_path, caplog):
     assert told == f"{tmp_path}: tables that show no IMU are left out: other.csv"
 
 
+def test_tables_of_a_folder_of_imus_that_show_none_are_named(tmp_path, caplog):
+    """Beside markers of a motion capture they were left out without a word."""
+    for folder in ("imu", "vicon"):
+        (tmp_path / folder).mkdir()
+    names = ["t [s]", *(f"g{a} [rad/s]" for a in "xyz"), *(f"a{a} [m/s^2]" for a in "xyz")]
+    write_csv(tmp_path / "imu" / "walk.csv", names, [T_S, *GYRO.T, *ACCEL.T])
+    for path in ("imu/steps.csv", "vicon/markers.csv"):
+        write_csv(tmp_path / path, ["A1", "A2", "A3", "B1"], [RNG.normal(0.0, 1.0, COUNT) for _ in range(4)])
+    assert len(table.sequences(tmp_path)) == 1
+    told = [line.getMessage() for line in caplog.records]
+    assert told == [f"{tmp_path}: tables that show no IMU are left out: imu/steps.csv, vicon/markers.csv"]
+
+
 def test_what_lies_beside_an_imu_and_is_not_read_is_named(tmp_path, caplog):
     """An array without names that has a time, as of TLIO, and true poses in a folder of their own, as of ADVIO."""
     names = ["t [s]", *(f"g{a} [rad/s]" for a in "xyz"), *(f"a{a} [m/s^2]" for a in "xyz")]

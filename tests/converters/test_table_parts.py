@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -155,6 +156,18 @@ def test_recordings_are_apart_where_the_time_begins_anew(tmp_path, header_again,
         path.write_text("\n".join(line for n, row in enumerate(rows) for line in ([header] if n % COUNT == 0 else []) + [row]))
     assert_parts(logs(path, mapping), PARTED)
     assert "'time_s' begins anew in row 201, 401: 3 recordings" in table.read_sequence(table.sequences(path)[0]).remarks.notes
+
+
+@pytest.mark.parametrize("form", ["utf-16", "gz", "parquet"])
+def test_the_time_of_a_packed_table_and_of_parquet_may_begin_anew(tmp_path, form):
+    plain, path = csv(tmp_path / "plain.csv", TIMED), tmp_path / f"all.{'parquet' if form == 'parquet' else 'csv'}"
+    if form == "parquet":
+        pyarrow.parquet.write_table(pyarrow.table(TIMED | dict(zip(NAMES, VALUES.T, strict=True))), path)
+    elif form == "gz":
+        (path := tmp_path / "all.csv.gz").write_bytes(gzip.compress(plain.read_bytes()))
+    else:
+        path.write_text(plain.read_text(), encoding=form)
+    assert_parts(logs(path), PARTED)
 
 
 @pytest.mark.parametrize("start", [3, PARTS * COUNT - 3])

@@ -561,3 +561,19 @@ def test_a_heading_counts_from_the_first_axis_of_the_positions(tmp_path, names):
     found = Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix()
     np.testing.assert_allclose(found, (world * TURN).as_matrix(), atol=1e-6)
     assert any("heading is taken as 0 along" in note for note in log.remarks.notes)
+
+
+@pytest.mark.parametrize("named", ["b_{}_{}", "bias_{}_{}", "b_{}_RS_S_{}"])
+def test_biases_of_an_estimate_are_no_imu(tmp_path: Path, named: str) -> None:
+    """As OKVIS, VIO programs and EuRoC name them, beside positions `p_WS_W_x`."""
+    (tmp_path / "imu.csv").write_text(imu_text())
+    words = {"b_{}_{}": ("g", "a"), "bias_{}_{}": ("gyro", "acc"), "b_{}_RS_S_{}": ("w", "a")}[named]
+    biases = [
+        f"{named.format(word, axis)} {unit}" for word, unit in zip(words, ("[rad/s]", "[m/s^2]"), strict=True) for axis in "xyz"
+    ]
+    names = ["t [s]", *(f"p_WS_W_{a}" for a in "xyz"), *(f"q_WS_{a}" for a in "xyzw"), *(f"v_WS_W_{a}" for a in "xyz"), *biases]
+    lines = rows(T_S, P_M, XYZW, 0.1 * P_M, *([0.01 + 0.0 * T_S] * 6))
+    (tmp_path / "okvis.csv").write_text(",".join(names) + "\n" + lines)
+    (found,) = table.sequences(tmp_path)
+    log = table.read_sequence(found)
+    assert ([*log.imus], [*log.poses]) == (["/imu0"], ["/estimate/pose"])

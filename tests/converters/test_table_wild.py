@@ -50,6 +50,16 @@ def test_the_steps_of_a_register_show_the_unit_of_the_gyro(tmp_path, unit, step,
     assert any(f" {unit}, as a common sensor does" in note for note in log.remarks.notes)
 
 
+@pytest.mark.parametrize(
+    ("unit", "step", "digits"), [("deg/s", 1 / 131, 15), ("deg/s", 0.07, 6), ("rad/s", np.deg2rad(1 / 16.4), 7)]
+)
+def test_the_steps_of_a_gesture_show_the_unit_too(unit, step, digits):
+    counts = np.round(np.random.default_rng(4).normal(0.0, 4000.0, (300, 3)))
+    rates = np.vectorize(lambda value: float(f"{value:.{digits}g}"))(counts * step)
+    assert unit_by_steps(rates) == (unit, pytest.approx(step))
+    assert unit_by_steps(counts) is unit_by_steps(3.0 * rates) is unit_by_steps(rates + 0.3 * step) is None
+
+
 @pytest.mark.parametrize("grid", [1.0, 0.1, 0.125, 0.06, 0.03, 0.01, 0.0012, 0.0011, 0.001, 1 / 128, 1e-6, 9.80665 / 16384])
 @pytest.mark.parametrize("spread", [1.5, 5.0, 60.0])
 def test_other_steps_show_no_unit(grid, spread):
@@ -174,6 +184,51 @@ def test_a_table_of_ulog2csv_is_in_the_units_of_px4(tmp_path):
     columns = [1e6 * T_S, *(0.01 * COUNTS).T, 0 * T_S + 10_000, *(9.80665 * ACCEL_G).T]
     imu = read(write_csv(tmp_path / "run_sensor_combined_0.csv", names, columns)).imus["/imu0"]
     np.testing.assert_allclose(imu.gyro, 0.01 * COUNTS, rtol=1e-12)
+
+
+def test_matrices_as_matlab_writes_them_in_a_table(tmp_path):
+    """`acc_1` to `acc_3`: their rate stands in a comment, and the orientation beside them shows the gyro's unit."""
+    t_s = np.arange(2000) * 0.01
+    turned = Rotation.from_rotvec(np.stack([0.4 * np.sin(2 * t_s), 0.5 * np.sin(3 * t_s), 0.3 * np.cos(2 * t_s)], axis=1))
+    gyro = np.vstack([(turned[:-1].inv() * turned[1:]).as_rotvec() * 100.0, np.zeros((1, 3))])
+    accel, wxyz = turned.inv().apply([0.0, 0.0, 9.81]), turned.as_quat()[:, [3, 0, 1, 2]]
+    names = [*(f"ori_{n}" for n in "1234"), *(f"acc_{n}" for n in "123"), *(f"gyr_{n}" for n in "123")]
+    path = write_csv(tmp_path / "imu.csv", names, [*wxyz.T, *accel.T, *np.rad2deg(gyro).T])
+    path.write_text(f"// fs=100 nSamples=2000\n{path.read_text()}")
+    imu = read(path).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, gyro, atol=1e-9)
+    assert imu.period_s == pytest.approx(0.01)
+    four = write_csv(tmp_path / "four.csv", ["t", *(f"acc_{n}" for n in "1234"), *(f"gyr_{n}" for n in "1234")], [T_S] * 9)
+    with pytest.raises(ConfigError, match="no columns look like the gyro"):
+        read(four)
+
+
+@pytest.mark.parametrize("form", ["timestamp,sensor,axis,value", "Series;Time;Value"])
+def test_a_long_table_has_its_signals_as_columns(tmp_path, form):
+    """One value is missing, and with it a sample."""
+    values = np.round(np.hstack([RNG.normal(0.0, 0.1, (COUNT, 3)), 9.80665 * ACCEL_G]), 6)
+    lines = [
+        f"{t:.2f},{sensor},{axis},{value}" if "," in form else f"{sensor}{axis};{t:.2f};{value}"
+        for t, row in zip(T_S.tolist(), values.tolist(), strict=True)
+        for (sensor, axis), value in zip([(s, a) for s in ("gyro", "accel") for a in "xyz"], row, strict=True)
+    ]
+    del lines[6 * 50 + 4]
+    (tmp_path / "long.csv").write_text("\n".join([form, *lines]) + "\n")
+    (sequence,) = table.sequences(tmp_path / "long.csv")
+    log = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s", "accel_unit": "m/s^2", "time_unit": "s"})
+    np.testing.assert_array_equal(log.imus["/imu0"].gyro, np.delete(values[:, :3], 50, axis=0))
+    assert log.remarks.losses == ["1 times without a value of every signal are left out"]
+    (tmp_path / "twice.csv").write_text("\n".join([form, *lines, *lines[:6]]) + "\n")
+    with pytest.raises(DataError, match=r"long table whose signals .* have two at one\. Pivot it"):
+        read(tmp_path / "twice.csv")
+
+
+def test_a_gyro_in_degrees_is_asked_for_its_time(tmp_path):
+    """`gyr_x_deg` may be the rate or its sum."""
+    names = ["time_s", *(f"acc_{a}_mps2" for a in "xyz"), *(f"gyr_{a}_deg" for a in "xyz")]
+    path = write_csv(tmp_path / "imu.csv", names, [T_S, *(9.80665 * ACCEL_G).T, *RNG.normal(0.0, 1.0, (3, COUNT))])
+    with pytest.raises(ConfigError, match=r'gyro = \["gyr_x_deg", "gyr_y_deg", "gyr_z_deg"\]\ngyro_unit = "\?"'):
+        read(path)
 
 
 @pytest.mark.parametrize("sentence", ["VNIMU", "VNYMR", "VNQMR"])

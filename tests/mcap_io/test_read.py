@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import random
+import re
 import shutil
 import tracemalloc
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.codec import messages, schemas
@@ -408,6 +410,29 @@ def test_a_log_without_imu_lists_its_topics(foreign: Foreign, make: Make) -> Non
         LogError, match=r"no IMU topic; expected .* `imu` gyro=TOPIC,accel=TOPIC joins the vectors of a gyroscope"
     ):
         read(foreign(vectors, name="vectors"))
+
+
+@pytest.mark.parametrize("ros1", [False, True])
+def test_an_imu_whose_definition_has_another_order_is_not_read_in_that_of_ros(tmp_path: Path, make: Make, ros1: bool) -> None:
+    text = schemas.ros1_definition(schemas.IMU) if ros1 else schemas.definition(schemas.IMU)
+    other = {"angular_velocity": "linear_acceleration", "linear_acceleration": "angular_velocity"}
+    text = re.sub("|".join(other), lambda found: other[found[0]], text)
+    path = tmp_path / "odd.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        language, encoding = ("ros1msg", "ros1") if ros1 else ("ros2msg", "cdr")
+        channel = writer.register_channel("/imu", encoding, writer.register_schema(schemas.IMU, language, text.encode()))
+        for n in range(5):
+            payload = make(schemas.IMU, 1000 + n, np.array([0.0, 0.0, 9.8]), np.array([0.1, 0.2, 0.3]), ros1=ros1)
+            writer.add_message(channel, 1000 + n, payload, 1000 + n)
+        writer.finish()
+    if ros1:
+        with pytest.raises(LogError, match="another definition"):
+            read(path)
+    else:
+        imu = read(path).imu
+        assert (imu.gyro[0].tolist(), imu.accel[0].tolist()) == ([0.1, 0.2, 0.3], [0.0, 0.0, 9.8])
 
 
 def test_several_imus_are_listed(foreign: Foreign, make: Make) -> None:

@@ -11,11 +11,12 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec.formats import DEEPEST, MOST_FIELDS
-from imutool.mcap_io.codec.schemas import ByteWalk
+from imutool.mcap_io.codec.schemas import IMU, ByteWalk, definition
 
 NUMBERS = {
     **dict.fromkeys(("bool", "byte", "char", "uint8"), "u1"),
@@ -88,6 +89,16 @@ def parse(schema_name: str, text: bytes) -> Definition:
         known[name] = tuple(_fields(name, body))
     _check(root, known, {}, 0)
     return {**known, "": (Field("", root, None),)}  # last: a separator with nothing after it defines "" too
+
+
+def is_imu_of_ros(text: bytes) -> bool:
+    """Whether a definition of an Imu has the fields of ROS in their order; also one that cannot be read."""
+    with suppress(LogError):
+        own, ros = (parse(IMU, each) for each in (text, definition(IMU).encode()))
+        vectors = "geometry_msgs/Vector3", "geometry_msgs/Quaternion"
+        pairs = [([f[:3] for f in own.get(name, ())], [f[:3] for f in ros[name]]) for name in (_short(IMU), *vectors)]
+        return all(mine in ([], theirs) for mine, theirs in pairs)
+    return True
 
 
 def refuse_two(topic: str, schema_name: str, definitions: Iterable[Definition]) -> None:
