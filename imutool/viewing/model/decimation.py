@@ -1,4 +1,4 @@
-"""Lines and spectra, with as many points as a drawing shows."""
+"""Lines and spectra with as many points as a drawing shows."""
 
 from __future__ import annotations
 
@@ -66,16 +66,3 @@ def average_log_bins(
     count = np.diff(np.append(starts, len(decade)))
     sums = np.add.reduceat(power, starts, axis=0)
     return np.add.reduceat(frequency_hz, starts) / count, sums / count.reshape(-1, *[1] * (power.ndim - 1))
-
-
-def welch(x: Line, length: int) -> Float64[np.ndarray, " k"]:
-    """Welch's power spectral density at a rate of 1 Hz, from half overlapping windows by Hann.
-
-    As scipy.signal's, whose import takes a quarter of the time of a page.
-    """
-    weight = np.hanning(length + 1)[:-1]
-    windows = np.lib.stride_tricks.sliding_window_view(x, length)[:: length - length // 2]
-    lines = np.fft.rfft((windows - windows.mean(axis=1, keepdims=True)) * weight)
-    density = np.square(np.abs(lines)).mean(axis=0) / np.square(weight).sum()
-    density[1 : (length + 1) // 2] *= 2.0  # but the constant's and Nyquist's
-    return np.asarray(density)

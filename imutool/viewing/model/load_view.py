@@ -18,7 +18,6 @@ from imutool.bias.model import GAP_S
 from imutool.bias_start.aided_path import residual_prior
 from imutool.errors import ConfigError
 from imutool.file_location import Location
-from imutool.geometry import quaternion
 from imutool.inertial.aids import Aids, listed, parse_aids
 from imutool.inertial.metrics import evaluate
 from imutool.inertial.strapdown import StartPose, gaps_crossed, stretch_with_truth, with_velocity
@@ -252,7 +251,7 @@ def _score(run: Run, known: TruthSpan, align: Alignment) -> tuple[Trace, str]:
     if align == "none":
         return trace, ""
     shift_m = np.linalg.norm(moved.p_wb[valid].mean(axis=0) - path.p_wb[valid].mean(axis=0))
-    turn_deg = np.rad2deg(quaternion.length(quaternion.log(motion.q_wxyz))[0])
+    turn_deg = np.rad2deg(motion.rotation.magnitude())
     return trace, f"{run.name}: alignment {align} turned the path by {turn_deg:.3g} deg, its centre moved {shift_m:.3g} m."
 
 

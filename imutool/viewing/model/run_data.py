@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.signal import welch
+from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64, Int64
 from imutool.bias_start.aided_path import aided_path
@@ -20,7 +22,6 @@ from imutool.inertial.aids import Aids
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Poses, Scalars, Times, nanoseconds, seconds
 from imutool.recording.columns import quantile
-from imutool.viewing.model.decimation import welch
 from imutool.viewing.model.events import Event
 from imutool.viewing.model.trajectory_error import Alignment, Drift, Errors, Window
 
@@ -182,8 +183,8 @@ def level_start(imu: Imu) -> StartPose:
     """
     first = imu.between(int(imu.t_ns[0]), int(imu.t_ns[0]) + nanoseconds(LEVELLING_S))
     f_x, f_y, f_z = first.accel.mean(axis=0)
-    turns = np.array([[0.0, np.arctan2(-f_x, np.hypot(f_y, f_z)), 0.0], [np.arctan2(f_y, f_z), 0.0, 0.0]])
-    return StartPose(quaternion.running_product(quaternion.exp(turns))[1], np.zeros(3), np.zeros(3))
+    level = Rotation.from_euler("ZYX", [0.0, np.arctan2(-f_x, np.hypot(f_y, f_z)), np.arctan2(f_y, f_z)])
+    return StartPose(level.as_quat(scalar_first=True), np.zeros(3), np.zeros(3))
 
 
 def gap_rows(t_ns: Times) -> Int64[np.ndarray, " m"]:
@@ -229,13 +230,14 @@ def spectra(imu: Imu) -> Mapping[str, Spectrum]:
     """
     if len(imu) < MIN_SAMPLES:
         return {}
-    length = min(len(imu), max(MIN_SAMPLES, round(WINDOW_S / imu.period_s)))
-    frequency_hz = np.fft.rfftfreq(length, imu.period_s)[1:]  # without the constant part
+    rate_hz = 1.0 / imu.period_s
+    length = min(len(imu), max(MIN_SAMPLES, round(WINDOW_S * rate_hz)))
     densities = {}
     for kind, values in (("gyro", imu.gyro), ("accel", imu.accel)):
         along = map(np.ascontiguousarray, values.T)  # one column after the other is twice as fast
-        density = np.stack([welch(column, length) for column in along], axis=1)[1:] * imu.period_s
-        densities[kind] = Spectrum(frequency_hz, density)
+        columns = [welch(column, rate_hz, nperseg=length, detrend="constant") for column in along]
+        density = np.stack([found for _, found in columns], axis=1)
+        densities[kind] = Spectrum(columns[0][0][1:], density[1:])  # without the constant part
     return densities
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Bool, Float64
 from imutool.errors import ConfigError, DataError
@@ -112,7 +113,7 @@ def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Erro
 class RigidMotion(NamedTuple):
     """Rigid motion of an alignment: a rotation, then a shift, both in the world frame."""
 
-    q_wxyz: Float64[np.ndarray, "1 4"]
+    rotation: Rotation
     shift_m: Float64[np.ndarray, "3"]
 
 
@@ -130,37 +131,37 @@ def aligned(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignm
     if not valid.any():
         raise DataError("the truth is known at none of the estimate's stamps", expected="some overlap")
     if alignment == "none":
-        return estimate, RigidMotion(quaternion.exp(np.zeros((1, 3))), np.zeros(3))
+        return estimate, RigidMotion(Rotation.identity(), np.zeros(3))
     motion = _motion(estimate, truth, valid, alignment)
-    (R,) = quaternion.matrix(motion.q_wxyz)
+    R = motion.rotation.as_matrix()
     v_w = None if estimate.v_w is None else estimate.v_w @ R.T
-    q_wb_wxyz = quaternion.multiply(motion.q_wxyz, estimate.q_wb_wxyz)
+    q_wb_wxyz = quaternion.multiply(motion.rotation.as_quat(scalar_first=True)[None], estimate.q_wb_wxyz)
     return Poses(estimate.t_ns, estimate.p_wb @ R.T + motion.shift_m, q_wb_wxyz, v_w), motion
 
 
 def _motion(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignment: Alignment) -> RigidMotion:
     if alignment == "origin":
         row = int(np.argmax(valid))
-        start, true = (quaternion.unit(poses.q_wb_wxyz[[row]]) for poses in (estimate, truth))
-        return _about(quaternion.multiply(true, quaternion.inverse(start)), estimate.p_wb[row], truth.p_wb[row])
+        start, true = (Rotation.from_quat(poses.q_wb_wxyz[row], scalar_first=True) for poses in (estimate, truth))
+        return _about(true * start.inv(), estimate.p_wb[row], truth.p_wb[row])
     p, p_true = estimate.p_wb[valid], truth.p_wb[valid]
     centre, centre_true = p.mean(axis=0), p_true.mean(axis=0)
     if alignment == "yaw":
         (x, y, _), (x_true, y_true, _) = (p - centre).T, (p_true - centre_true).T
         angle = np.arctan2(x @ y_true - y @ x_true, x @ x_true + y @ y_true)
-        return _about(quaternion.exp(np.array([[0.0, 0.0, angle]])), centre, centre_true)
+        return _about(Rotation.from_rotvec([0.0, 0.0, angle]), centre, centre_true)
     motion = align(p, p_true)
     if motion is None:
         raise DataError(
             "positions lie on a line and leave the turn about it open", where="align", fix="Use yaw, origin or none for `align`"
         )
     R, shift_m = motion
-    return RigidMotion(quaternion.of_matrix(R), shift_m)
+    return RigidMotion(Rotation.from_matrix(R), shift_m)
 
 
-def _about(q_wxyz: Float64[np.ndarray, "1 4"], centre: Float64[np.ndarray, "3"], goal: Float64[np.ndarray, "3"]) -> RigidMotion:
+def _about(rotation: Rotation, centre: Float64[np.ndarray, "3"], goal: Float64[np.ndarray, "3"]) -> RigidMotion:
     """Rotation about a centre that moves it to another point."""
-    return RigidMotion(q_wxyz, goal - quaternion.matrix(q_wxyz)[0] @ centre)
+    return RigidMotion(rotation, goal - rotation.as_matrix() @ centre)
 
 
 def drift_since_reset(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], reset_s: float = RESET_S) -> Drift:

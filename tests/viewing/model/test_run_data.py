@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.signal import welch as welch_of_scipy
 from scipy.spatial.transform import Rotation
 
 from imutool.errors import ConfigError, DataError
@@ -17,7 +16,6 @@ from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.made_up_flight import ACCEL, GYRO, flight
 from imutool.viewing.model import load_view
-from imutool.viewing.model.decimation import welch
 from imutool.viewing.model.events import Event
 from imutool.viewing.model.load_view import build
 from imutool.viewing.model.run_data import (
@@ -361,13 +359,6 @@ def test_a_vibration_is_found_on_its_axis_with_its_power_and_a_constant_nowhere(
     assert power == pytest.approx(0.3**2 / 2, rel=1e-3)
     assert line.density[:, [0, 2]].max() < 1e-20
     assert found["accel"].density.max() < 1e-20
-
-
-@pytest.mark.parametrize(("samples", "length"), [(64, 64), (1000, 65), (1000, 64)])
-def test_a_density_is_that_of_scipy(samples: int, length: int) -> None:
-    x = np.random.default_rng(1).normal(size=samples)
-    _, expected = welch_of_scipy(x, 1.0, nperseg=length, detrend="constant")
-    np.testing.assert_allclose(welch(x, length)[1:], expected[1:], rtol=1e-12)
 
 
 def test_a_log_too_short_has_no_spectrum() -> None:

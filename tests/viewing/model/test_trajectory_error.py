@@ -13,15 +13,7 @@ from imutool.errors import DataError
 from imutool.inertial.metrics import write_tum
 from imutool.inertial.strapdown import StartPose, along_truth, dead_reckon
 from imutool.recording import Imu, Poses, Recording
-from imutool.viewing.model.trajectory_error import (
-    ALIGNMENTS,
-    Alignment,
-    RigidMotion,
-    aligned,
-    drift_since_reset,
-    errors,
-    windows,
-)
+from imutool.viewing.model.trajectory_error import ALIGNMENTS, Alignment, aligned, drift_since_reset, errors, windows
 
 AGREEMENT = 1e-9  # both round once a sample, in another order
 EVO_TOLERANCE = 1e-6  # evo reads what was written with nine decimals
@@ -45,10 +37,6 @@ def moved(poses: Poses, turn: Rotation, shift: np.ndarray) -> Poses:
     q = (turn * Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True)).as_quat(scalar_first=True)
     assert poses.v_w is not None
     return Poses(poses.t_ns, poses.p_wb @ R.T + shift, np.ascontiguousarray(q), poses.v_w @ R.T)
-
-
-def turned(motion: RigidMotion) -> Rotation:
-    return Rotation.from_quat(motion.q_wxyz[0], scalar_first=True)
 
 
 def test_drift_is_that_of_integrating_anew_from_every_reset(stretch: Stretch) -> None:
@@ -94,7 +82,7 @@ def test_no_alignment_changes_no_bit(stretch: Stretch) -> None:
     _, path, true, valid = stretch
     same, motion = aligned(path, true, valid, "none")
     assert same == path
-    assert turned(motion).magnitude() == 0.0
+    assert motion.rotation.magnitude() == 0.0
     assert not motion.shift_m.any()
 
 
@@ -103,7 +91,7 @@ def test_a_planted_motion_about_the_vertical_is_found_by_every_alignment(stretch
     _, _, true, valid = stretch
     turn, shift = MOVED
     back, motion = aligned(moved(true, turn, shift), true, valid, alignment)
-    assert (turned(motion) * turn).magnitude() < FOUND
+    assert (motion.rotation * turn).magnitude() < FOUND
     np.testing.assert_allclose(back.p_wb, true.p_wb, atol=1e-7)
     assert errors(back, true, valid).orientation_total_deg[valid].max() < 1e-5
     assert back.v_w is not None
@@ -116,13 +104,13 @@ def test_the_truths_holes_count_in_no_alignment(stretch: Stretch) -> None:
     wrong[~valid] += 1000.0
     estimate = Poses(true.t_ns, wrong, true.q_wb_wxyz, true.v_w)
     for alignment in ("origin", "yaw", "se3"):
-        assert turned(aligned(estimate, true, valid, alignment)[1]).magnitude() < FOUND  # type: ignore[arg-type]
+        assert aligned(estimate, true, valid, alignment)[1].rotation.magnitude() < FOUND  # type: ignore[arg-type]
 
 
 def test_yaw_turns_about_the_vertical_alone_and_is_the_best_such_turn(stretch: Stretch) -> None:
     _, path, true, valid = stretch
     best, motion = aligned(path, true, valid, "yaw")
-    np.testing.assert_allclose(turned(motion).apply([0.0, 0.0, 1.0]), [0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(motion.rotation.apply([0.0, 0.0, 1.0]), [0.0, 0.0, 1.0], atol=1e-12)
 
     def misfit(poses: Poses) -> float:
         away = (poses.p_wb - true.p_wb)[valid]
@@ -148,7 +136,7 @@ def test_positions_on_a_line_leave_the_turn_open(stretch: Stretch) -> None:
     line = Poses(true.t_ns, np.outer(np.arange(len(true)), [1.0, 0.0, 0.0]), true.q_wb_wxyz)
     with pytest.raises(DataError, match="line"):
         aligned(line, line, valid, "se3")
-    assert turned(aligned(line, line, valid, "yaw")[1]).magnitude() < FOUND
+    assert aligned(line, line, valid, "yaw")[1].rotation.magnitude() < FOUND
     with pytest.raises(DataError, match="none of the estimate's stamps"):
         aligned(line, line, np.zeros(len(line), bool), "se3")
 
