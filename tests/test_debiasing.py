@@ -35,7 +35,7 @@ from imutool.cleaning import CleaningSettings
 from imutool.cli.debias import assigned
 from imutool.conversion.run import convert
 from imutool.debiasing import Debiaser, debias
-from imutool.errors import ConfigError, LogError, ModelError
+from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu, decode_scalars
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
@@ -715,6 +715,9 @@ def test_the_static_estimate_is_a_model_and_its_start(recording: Recording) -> N
     model, start = estimate_at_rest(recording.imu, "here")
     assert model.method == "static"
     np.testing.assert_array_equal(apply(model, start, recording.imu).bias, np.tile(start.rest, (len(recording.imu), 1)))
+    counts = replace(recording.imu, accel=1e9 * recording.imu.accel)
+    with pytest.raises(DataError, match=r"^counts\.mcap: 0 of \d+ samples are a measurement"):
+        estimate_at_rest(counts, "counts.mcap")
 
 
 # ── a real recording ─────────────────────────────────────────────────────────────────────────────────────────────────

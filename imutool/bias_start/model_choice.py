@@ -277,15 +277,15 @@ def estimate_at_rest(imu: Imu, where: str | Location) -> tuple[BiasModel, Initia
         DataError: fewer than two samples.
         ModelError: the log never rests.
     """
-    good = measured(imu.gyro, imu.accel)
-    imu = imu if good.all() else imu.rows(good)
-    return _estimate(block_statistics([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s), where)
+    kept = imu.rows(measured(imu.gyro, imu.accel))
+    if len(kept) < 2:  # raw counts, for instance
+        raise DataError(f"{len(kept)} of {len(imu)} samples are a measurement", where=where, fix="See imutool info LOG")
+    return _estimate(block_statistics([(kept.t_ns, kept.gyro, kept.accel)], kept.period_s), where)
 
 
 def _estimate(blocks: Blocks, where: str | Location) -> tuple[BiasModel, InitialBias]:
-    model = static.Model()
     try:
-        return model, over_all_rest(model, blocks)
+        return (model := static.Model()), over_all_rest(model, blocks)
     except DataError as error:
         raise _no_start(where) from error
 

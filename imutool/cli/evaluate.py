@@ -123,9 +123,7 @@ def evaluate(
             if report is not None:
                 scored = [name for name in model or () if name not in refused]
                 run_data = load(log, models=scored, aid=asked, **read)
-                loaded.append(
-                    replace(run_data, notes=(*run_data.notes, *_late(results[first:])))
-                )  # it judges the models itself
+                loaded.append(replace(run_data, notes=(*run_data.notes, *_late(results[first:]))))
         if report is not None:
             tell(len(logs), len(logs), "drawing")
             pages.write_page(loaded, report, overwrite=common.overwrite)
