@@ -110,12 +110,9 @@ def _times_fall(path: Path, names: list[str]) -> bool:
     """Whether a time of a Parquet file goes back."""
     times = [name for name in names if re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(name)[0])]
     with refusing(path):
-        for column in _module("pyarrow.parquet", path).read_table(path, columns=times).columns if times else ():
-            if re.match(NUMBERS, str(column.type)) and column.null_count == 0:
-                values = column.to_numpy()
-                if (np.diff(values.astype(np.int64 if values.dtype.kind == "M" else float)) < 0).any():
-                    return True
-    return False
+        columns = _module("pyarrow.parquet", path).read_table(path, columns=times).columns if times else []
+    values = [column.to_numpy() for column in columns if re.match(NUMBERS, str(column.type)) and not column.null_count]
+    return any((np.diff(each.astype(np.int64 if each.dtype.kind == "M" else float)) < 0).any() for each in values)
 
 
 def _names_of(path: Path, kind: str) -> list[str]:

@@ -92,7 +92,7 @@ def parse(schema_name: str, text: bytes) -> Definition:
 
 
 def is_imu_of_ros(text: bytes) -> bool:
-    """Whether a definition of an Imu has the fields of ROS in their order; also one that cannot be read."""
+    """Whether an Imu's definition has the fields of ROS in order, as far as it can be read."""
     with suppress(LogError):
         own, ros = (parse(IMU, each) for each in (text, definition(IMU).encode()))
         vectors = "geometry_msgs/Vector3", "geometry_msgs/Quaternion"
