@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn, get_args
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand
 from typer.models import CommandFunctionType
 
 from imutool import __version__, registry
 from imutool.cli.overview import ABOUT, fitted, show
-from imutool.cli.parameters import FOLDERS, PlainValue, current, error_with_flags, flags, instead_of, with_flags
+from imutool.cli.parameters import FOLDERS, Group, PlainValue, current, error_with_flags, flags, instead_of, with_flags
 from imutool.cli.terminal import log_to_stderr, plain, progress, say, stdout_for_one, tell_error, write_json
 from imutool.errors import INTERRUPTED, PIPE_CLOSED, ConfigError, ImutoolError, redact, was_interrupted
 from imutool.file_location import first_bytes
@@ -33,16 +33,12 @@ NOTHING_LEFT, MAKE_ROOM = "Nothing half-written is left", "Choose another place 
 FIXES = {FileNotFoundError: "Look whether it is still there", PermissionError: "See who may read it, or write there"}
 
 
-class _Commands(TyperGroup):
+class _Commands(Group):
     """Group of commands that reports an interrupt; typer would exit without a message."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Print the page of `imutool --help`."""
         show()
-
-    def get_params(self, ctx: Any) -> list[Any]:
-        """Parameters with --help; they convert texts and paths by themselves."""
-        return [PlainValue.into(parameter) for parameter in super().get_params(ctx)]
 
     def invoke(self, ctx: Any) -> Any:
         with caught():

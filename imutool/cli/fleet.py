@@ -12,7 +12,7 @@ import typer
 
 from imutool.cli.app import COMMON, App, Common, Init, Smooth, Truth, Written, app, expanded, with_options
 from imutool.cli.debias import FORCE_HELP, VERIFY_HELP
-from imutool.cli.parameters import with_flags
+from imutool.cli.parameters import Group, with_flags
 from imutool.cli.terminal import say
 from imutool.errors import ConfigError
 from imutool.fleet.task import Settings
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 fleet = App(
     name="fleet",
     help="Process many logs on all cores of this machine, or on a Ray cluster.",
+    cls=Group,
     no_args_is_help=True,
     rich_markup_mode="rich",
 )

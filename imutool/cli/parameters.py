@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from typer.core import TyperGroup
+
 from imutool.errors import ConfigError, ImutoolError
 from imutool.file_location import location
 
@@ -124,7 +126,7 @@ def _of_url(text: str) -> Path:
 
 
 class PlainValue:
-    """Conversion of texts and paths without pydantic.
+    """Conversion of texts, paths and defaults without pydantic.
 
     Typer's conversion serves everything else; its import of pydantic takes 0.2 s of CPU.
     """
@@ -138,6 +140,8 @@ class PlainValue:
         several = param.multiple or param.nargs == -1
         if value is None:
             return () if several else None
+        if self._kind is None and value == param.default:
+            return value
         words = value if isinstance(value, list | tuple) else [value]
         unreadable = self._kind is Path and any(Path(word).exists() and not os.access(word, os.R_OK) for word in words)
         if self._kind is None or unreadable or not all(isinstance(word, str | Path) for word in words):
@@ -154,3 +158,11 @@ class PlainValue:
         if otherwise is not None and described is not None and not isinstance(otherwise, partial):
             parameter.get_runtime_param = partial(PlainValue, described.annotation, otherwise)
         return parameter
+
+
+class Group(TyperGroup):
+    """Group of commands whose own options need no pydantic."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Parameters with --help; they convert texts and paths by themselves."""
+        return [PlainValue.into(parameter) for parameter in super().get_params(ctx)]

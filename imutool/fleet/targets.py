@@ -97,7 +97,7 @@ def without_suffix(log: str) -> str:
 
 
 def digest(target: Location) -> dict[str, str]:
-    """Name and digest of a target: SHA-256, or above `LARGEST_HASHED` of a log `digest_with_crcs`.
+    """Name and digest of a target: SHA-256, or for a larger log `digest_with_crcs`.
 
     SHA-256 of all bytes would take a seventh of the time of a fleet.
     """

@@ -70,11 +70,20 @@ def test_debias_of_a_log_with_poses_does_without_what_takes_long_to_import(tmp_p
     assert (tmp_path / "out.mcap").exists()
 
 
-def test_repair_and_clean_do_without_scipy(tmp_path: Path) -> None:
-    write(flight(2, duration_s=20.0), tmp_path / "flight.mcap")
-    for word in ("repair", "clean"):
-        assert loaded_by_command([word, tmp_path / "flight.mcap", tmp_path / f"{word}.mcap"], {"scipy"}) == []
-        assert (tmp_path / f"{word}.mcap").exists()
+@pytest.mark.parametrize(
+    ("words", "module"),
+    [
+        ("repair LOG OUT", "scipy"),
+        ("clean LOG OUT", "scipy"),
+        ("view LOG --html OUT", "rerun"),
+        ("fleet info LOG OUT", "scipy"),
+        ("simulate LOG OUT", "scipy.signal"),
+    ],
+)
+def test_a_command_needs_no_pydantic_and_no_more_than_it_computes(tmp_path: Path, words: str, module: str) -> None:
+    write(flight(2, duration_s=20.0), tmp_path / "LOG")
+    assert loaded_by_command(words.split(), {module, "pydantic"}, tmp_path) == []
+    assert (tmp_path / "OUT").exists()
 
 
 def test_a_log_without_poses_does_without_masked_arrays(tmp_path: Path) -> None:

@@ -24,7 +24,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
-from scipy.signal import lfilter
 
 from imutool.array_types import Complex128, Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
@@ -224,6 +223,8 @@ def filtered(x: Float64[np.ndarray, " n"], by: Filter) -> Float64[np.ndarray, " 
     from_first[n:] = from_first[n - 1]
     driven = np.convolve(from_first, by.taps[:half])[: len(from_first)]  # numpy is quick for up to 11 taps
     driven[half:] += np.convolve(from_first, by.taps[half:])[: len(from_first) - half]
+    from scipy.signal import lfilter  # half a second, in a simulation without this effect too
+
     return np.asarray(lfilter([1.0], by.denominator, driven)[AHEAD:] + x[0])
 
 
