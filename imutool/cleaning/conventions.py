@@ -20,7 +20,7 @@ from imutool.cleaning.pose_delay import Delay, StepIntegral, pose_delay, usable
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, is_other_world, left_when_turned, read_right
 from imutool.cleaning.position_unit import POSITIONS, Misfits, position_unit
 from imutool.cleaning.samples import STEP_S, Motion
-from imutool.cleaning.truth import Truth, axis_of_gravity, best_rotation, force_in_world, rotation_deg, turning
+from imutool.cleaning.truth import Truth, axis_of_gravity, best_rotation, force_in_world, rotation_deg, stays_level, turning
 from imutool.cleaning.unit_evidence import RATES
 from imutool.geometry import quaternion
 from imutool.recording import GRAVITY_M_S2
@@ -197,9 +197,7 @@ def _gyro_against_poses(
 ) -> Reading | None:
     """Reading of the gyro under which it is the rate of the poses."""
     true, measured, first_s, last_s = _rates(step, mean, start_ns, truth)
-    if not len(true):
-        return None
-    readings = _rate_readings(float(quantile(np.linalg.norm(measured, axis=1), 0.9)))
+    readings = _rate_readings(float(quantile(np.linalg.norm(measured, axis=1), 0.9))) if len(true) else []
     if not readings:
         return None
     errors = np.stack([np.linalg.norm(true - measured @ M.T, axis=1) for _, M in readings])
@@ -290,6 +288,8 @@ def _accel_against_poses(
     if choice is None or choice.misfit[choice.best] > CLEARLY * GRAVITY_M_S2:
         return None, in_mean, unit, ""
     P, up = readings[choice.best]
+    if straight and up[2] < 0.0 and (np.diag([1.0, 1.0, -1.0]) == P).all() and stays_level(q_wb):  # mirrored, it fits alike
+        return None, in_mean, unit, ""
     as_is = float(np.sqrt(median(np.sum((a_w + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb, f)) ** 2, axis=1))))
     alike = [readings[row] for row in np.flatnonzero(choice.alike).tolist()]
     one_axes = all((other == P).all() for other, _ in alike)

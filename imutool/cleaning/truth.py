@@ -17,6 +17,7 @@ from imutool.recording import GRAVITY_M_S2, Poses, Recording, seconds
 
 FEWEST = 3  # poses that show an acceleration
 ERRORS_LAST_S = 1.0  # errors of poses are alike for so long
+LEVEL_RAD = 0.1  # deviation of the vertical in the body
 ALONG, GRAVITY_BAND = np.cos(np.radians(20.0)), 0.25  # of a mean force that is gravity along an axis
 
 
@@ -108,6 +109,12 @@ def axis_of_gravity(force_w: Float64[np.ndarray, "n 3"]) -> str | None:
     axis, size = int(np.argmax(np.abs(mean))), float(np.linalg.norm(mean))
     along = abs(mean[axis]) > ALONG * size and abs(size / GRAVITY_M_S2 - 1.0) < GRAVITY_BAND
     return f"{'+' if mean[axis] > 0.0 else '-'}{'xyz'[axis]}" if along else None
+
+
+def stays_level(q_wb: Float64[np.ndarray, "n 4"]) -> bool:
+    """Whether a body turns about the vertical alone, but for less than a mount may be tilted."""
+    vertical = quaternion.rotate(q_wb, np.tile([0.0, 0.0, 1.0], (len(q_wb), 1)))
+    return bool(np.sqrt(vertical.var(axis=0).sum()) < LEVEL_RAD)
 
 
 def best_rotation(gyro: Float64[np.ndarray, "n 3"], omega: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3 3"]:

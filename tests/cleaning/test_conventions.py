@@ -407,6 +407,14 @@ def test_rest_and_planar_motion_propose_nothing(name: str, posed: str, tilt_deg:
     assert (survey.matrices == np.eye(3)).all()
 
 
+def test_a_car_whose_accelerometer_is_tilted_drives_in_a_world_that_is_z_up() -> None:
+    """It stays level, so a mirrored accelerometer in a mirrored world fits as well."""
+    imu, poses = turned(waves(60.0, (0.02, 0.02, 0.12), 11), waves(60.0, (0.5, 0.5, 0.0), 21))
+    tilted = Imu(imu.t_ns, imu.gyro, imu.accel @ Rotation.from_euler("xy", (3.0, -3.0), degrees=True).as_matrix().T)
+    found = judge(motion_of(tilted), of_poses("/ground_truth/pose", poses), 1.0)
+    assert (found.up, found.accel) == ("+z", None)
+
+
 def test_wheel_odometry_of_another_frame_is_no_evidence() -> None:
     """Poses of unknown kind that turn otherwise than the gyro, about one axis: nothing is said of the gyro's axes."""
     imu, poses = turned(waves(60.0, (0.01, 0.01, 0.4)), waves(60.0, (1.0, 1.0, 0.1), 4))
