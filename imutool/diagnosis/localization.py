@@ -52,7 +52,7 @@ def locate_residual(
     """Locations of unexplained residuals: running means beyond those of calm seconds, or all.
 
     `p_values` are those of white noise, by signal. Beside an exact simulation the samples count where they hold far more than
-    the means, which lose a vibration; poses know nothing of it.
+    the means, which lose a vibration. Poses show no such motion.
     """
     left = [pair.real - a for pair, a in zip(pairs, after, strict=True)]
     counts = (settings.mean_samples, 1) if all(pair.exact for pair in pairs) else (settings.mean_samples,)

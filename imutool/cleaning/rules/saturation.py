@@ -118,8 +118,8 @@ def _middles(steps: Float64[np.ndarray, "b n"]) -> Float64[np.ndarray, " b"]:
 class Plateau:
     """Samples near an end of an axis that change less than at rest.
 
-    A sensor that is clipped before its calibration for temperature or scale has no value that repeats. Steps of noise differ from
-    one to the next by sqrt(3) of their size; smooth motion without noise is calm wherever it turns back, and no plateau.
+    A sensor that is clipped before its calibration for temperature or scale has no value that repeats. Steps of noise differ
+    from one to the next by sqrt(3) of their size; smooth motion without noise is calm wherever it turns back, and no plateau.
     """
 
     def __init__(self) -> None:

@@ -763,6 +763,14 @@ def test_a_gyro_is_not_ahead_of_a_slow_accelerometer_but_the_clock_is() -> None:
     assert found.chosen[0][1] == pytest.approx([0.004], abs=3e-4)
 
 
+def test_a_gyro_that_is_ahead_is_plainer_than_a_clock_and_a_filter() -> None:
+    """Its delay alone gave way to two effects that leave no less."""
+    logs = [planted.weighed(planted.pair(trembling(6.0), {"gyro_delay": [-0.00125]}))]
+    delay = next(of for of in planted.catalogue() if of.key == "gyro_delay")
+    now = fit(logs, ((delay, np.array([-0.001])),))
+    assert with_filter_of_each_sensor(logs, now, planted.catalogue()) is now
+
+
 def test_a_filter_of_each_sensor_that_shows_its_lag_alone_has_no_order_by_chance() -> None:
     """Far above the motion all forms are alike, and one of a single parameter looked sure of its cut-off."""
     of_gyro, of_accel = ("second_order_low_pass", [40.0, 0.7]), ("low_pass", [8.0])

@@ -158,8 +158,9 @@ def with_filter_of_each_sensor(logs: Sequence[WhitenedLog], now: Fit, named: Seq
     best = beside(early_s, *((of, np.array([-early_s])) for of in clocks if early_s))
     for of in second:
         best = _with_own_form(logs, best, of.sensors, named)
-    if early_s:
-        return best if _form_bic(best) < _form_bic(now) + logs[0].pair.settings.search.clearly_better else now
+    if early_s:  # with a filter in its place neither answer is the plainer one
+        slack = logs[0].pair.settings.search.clearly_better if len(lags) > 1 else 0.0
+        return best if _form_bic(best) < _form_bic(now) + slack else now
     shared_s = CLOCKS_SHARE * min(lag_s.values())  # of the lag of both may be the clock's
     offsets = [beside(shared_s, (of, np.array([-shared_s]))) for of in clocks if len(second) > 1]
     best = min((best, *offsets), key=_form_bic)
