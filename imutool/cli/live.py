@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -64,7 +63,6 @@ def live(
     from imutool.viewing.stream.session import run
     from imutool.viewing.stream.sources import open_source
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # `timeout` and a service end it as Ctrl-C does: nothing is lost
     malformed = Malformed()
     origin = source or log
     if origin is None or (source and log):

@@ -51,7 +51,8 @@ def unit_by_steps(rates: Float64[np.ndarray, "n 3"]) -> tuple[str, float] | None
 def _are_whole(rates: Float64[np.ndarray, "n 3"], step: float) -> bool:
     """Whether all values are whole numbers of a step and of no multiple, as of a motion with few values near the median."""
     counts = rates[np.isfinite(rates)] / step
-    whole = np.unique(counts.round())
+    whole = np.sort(counts.round())  # np.unique imports numpy.ma
+    whole = whole[np.diff(whole, prepend=-np.inf) > 0.0]
     if len(whole) < LEAST_WHOLE or np.abs(counts - counts.round()).max() > WHOLE_OFF:
         return False
     return bool(np.abs(whole).max() < MOST_COUNTS and np.gcd.reduce(whole.astype(np.int64)) == 1)

@@ -51,7 +51,7 @@ def run(
     seconds: float | None = None,
     force: bool = False,
 ) -> StreamStatistics:
-    """Debias a stream until it ends, `seconds` have passed or Ctrl-C is pressed.
+    """Debias a stream until it ends, `seconds` have passed, or Ctrl-C or SIGTERM comes.
 
     The initial bias is that of the stop in the first two seconds, else the model's prior (`bias_start.bias_at_rest.auto`); the
     samples until then are corrected late and are not counted in the delay.
@@ -65,7 +65,7 @@ def run(
         try:
             for found in timely(source, seconds):
                 session.add(found, batches)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit):  # Ctrl-C; `timeout` or a service: what came so far is kept
             pass
         session.end(batches)
     return session.statistics(malformed, batches.lost)
