@@ -24,8 +24,7 @@ from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.observability import with_plainer_effects
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.estimation.trial import verdicts
-from imutool.diagnosis.estimation.trial.effect_forms import exponential
-from imutool.diagnosis.estimation.trial.lag_start import with_delay_of_accel, with_filter_of_each_sensor, with_form_of_low_pass
+from imutool.diagnosis.estimation.trial.lag_start import with_delay_of_accel, with_filter_of_each_sensor
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
 from imutool.diagnosis.settings import SearchSettings
@@ -777,17 +776,6 @@ def test_a_filter_of_each_sensor_that_shows_its_lag_alone_has_no_order_by_chance
     selection = asked(through(trembling(6.0), of_gyro, of_accel, 0.0), beyond=False)
     assert names(selection) in (["low_pass:accel", "gyro_delay"], ["gyro_delay", "low_pass:accel"])
     assert sure(selection, "gyro_delay", [2.0 * 0.7 / (2.0 * np.pi * 40.0)])
-
-
-def test_an_analog_filter_whose_lag_a_clock_takes_back_is_no_smoothing() -> None:
-    """Of slow motion smoothing beside a clock that is off by half a sample leaves as little, with one parameter more."""
-    hidden = {"clock_offset": [0.012], "low_pass": [12.0, math.inf, 1.0, math.inf]}
-    logs = [planted.weighed(planted.pair(planted.rich(2), hidden))]
-    offset, filtered = (next(of for of in planted.catalogue() if of.key == key) for key in ("clock_offset", "low_pass"))
-    wrong = fit(logs, ((offset, np.array([0.0098])), (exponential(filtered), np.array([11.9, planted.RATE_HZ]))))
-    found = with_form_of_low_pass(logs, wrong, planted.catalogue())
-    assert [effect.key for effect, _ in found.chosen] == ["clock_offset", "low_pass"]
-    assert np.concatenate([theta for _, theta in found.chosen]) == pytest.approx([0.012, 12.0], rel=0.01)
 
 
 def test_two_exponential_filters_in_a_row_are_one_low_pass_and_no_clock() -> None:
