@@ -73,12 +73,7 @@ def with_form_of_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequence
     settings, period_s = logs[0].pair.settings.search, logs[0].pair.period_s
     error = _model_error(logs)
     for k, (effect, _) in enumerate(now.chosen):
-        if effect.name not in LOW_PASSES:
-            continue
-        if {RATE, SMOOTHING} & {*effect.parameters}:
-            analog = fit(logs, _as_analog(now, k, named), near=now)
-            if _form_bic(analog) < _form_bic(now):
-                return with_form_of_low_pass(logs, analog, named)
+        if effect.name not in LOW_PASSES or {RATE, SMOOTHING} & {*effect.parameters}:
             continue
         errs, best = error * _taken(now, k), now
         for chosen in _forms(now, k, _allowed(now, k, named), 1.0 / period_s):
@@ -244,16 +239,6 @@ def _forms(now: Fit, k: int, named: Sequence[Effect], rate_hz: float) -> Iterato
         start_s = lag_s - at_s[0] if at_s else 0.5 * lag_s
         for start in _starts(form, form, None, start_s, rate_hz) if start_s > 0.0 else ():
             yield (*without, start) if at_s else (*others, start, (offset, np.array([-start_s])))
-
-
-def _as_analog(now: Fit, k: int, named: Sequence[Effect]) -> Chosen:
-    """Effects with an analog filter for a digital one; a clock takes what it lags more. Steps to a large lag may miss it."""
-    effect, theta = now.chosen[k]
-    plain = next(of for of in named if (of.name, of.sensors, of.constants) == (effect.name, effect.sensors, effect.constants))
-    start = theta[: len(plain.parameters)]
-    more_s = Design.of(plain, start).lag_s - Design.of(effect, theta).lag_s
-    others = ((of, x + more_s) if of.name == "clock_offset" else (of, x) for of, x in now.chosen)
-    return tuple((plain, start) if index == k else entry for index, entry in enumerate(others))
 
 
 def _starts(other: Effect, effect: Effect, theta: Theta | None, lag_s: float, rate_hz: float) -> list[tuple[Effect, Theta]]:
