@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from imutool.cli.parameters import with_flags
-from imutool.errors import ConfigError, redact
+from imutool.errors import ConfigError, ImutoolError, redact
 from imutool.file_location import to_location
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.storage.target import Target
@@ -156,6 +156,25 @@ def write_json(report: Report | Mapping[str, Any], where: str | None, *, overwri
     with Target(to_location(where), overwrite=overwrite) as target:
         target.write(text.encode())
     return False
+
+
+@contextmanager
+def kept_for_end(errors: list[ImutoolError]) -> Iterator[None]:
+    """Keep the error of one log of several for `raise_kept`; a wrong command line ends the command at once."""
+    try:
+        yield
+    except ConfigError:
+        raise
+    except ImutoolError as error:
+        errors.append(error)
+
+
+def raise_kept(errors: Sequence[ImutoolError]) -> None:
+    """Raise the first error, if there is one, and print the others as warnings."""
+    for error in errors[1:]:
+        logger.warning("%s", error)
+    if errors:
+        raise errors[0]
 
 
 class _Lines(logging.Handler):

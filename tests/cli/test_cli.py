@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -222,6 +223,14 @@ def test_a_reader_that_has_left_is_no_error(logs: Path, command: str, words: lis
     finally:
         os.close(writing)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_a_help_page_that_cannot_be_written_is_no_bug(code: Code, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(cli, "show", full)
+    assert code("--help") == errors.ConfigError.exit_code
 
 
 def test_a_command_without_standard_output_does_its_work(logs: Path, tmp_path: Path) -> None:
