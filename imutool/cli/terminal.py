@@ -160,7 +160,7 @@ def write_json(report: Report | Mapping[str, Any], where: str | None, *, overwri
 
 @contextmanager
 def kept_for_end(errors: list[ImutoolError]) -> Iterator[None]:
-    """Keep the error of one log of several for `raise_kept`; a wrong command line ends the command at once."""
+    """Keep the error of one log for `raise_kept`, not that of a wrong command line."""
     try:
         yield
     except ConfigError:
