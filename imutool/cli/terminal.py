@@ -182,24 +182,25 @@ class _Lines(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__()
-        self._level, self._text, self._others = "", "", list[str]()
+        self._level, self._text, self._logs = "", "", list[str]()
 
     def emit(self, record: logging.LogRecord) -> None:
         log, colon, text = record.getMessage().partition(": ")
         level = record.levelname.lower()
         if colon and (level, text) == (self._level, self._text):
-            self._others.append(log)
+            if log not in self._logs:  # a command may read a log twice
+                self._logs.append(log)
             return
         self.flush()
-        self._level, self._text = level, text
+        self._level, self._text, self._logs = level, text, [log]
         say(with_flags(f"{level}: {record.getMessage()}"), to=err)
 
     def flush(self) -> None:
         """Name the other logs of the last text."""
-        if self._others:
-            more = len(self._others) - 1
-            say(f"{self._level}: {self._others[0]}{f' and {more} other' if more else ''}{'s' * (more > 1)}: the same", to=err)
-        self._level, self._text, self._others = "", "", []
+        if others := self._logs[1:]:
+            more = len(others) - 1
+            say(f"{self._level}: {others[0]}{f' and {more} other' if more else ''}{'s' * (more > 1)}: the same", to=err)
+        self._level, self._text, self._logs = "", "", []
 
 
 def log_to_stderr(verbose: bool, quiet: bool) -> None:

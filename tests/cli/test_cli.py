@@ -100,7 +100,7 @@ def test_a_message_of_many_lines_is_whole(capsys: pytest.CaptureFixture[str]) ->
 
 def test_what_several_logs_in_a_row_have_alike_is_printed_once(capsys: pytest.CaptureFixture[str]) -> None:
     with terminal.progress("Reading", verbose=False, quiet=False):
-        for log, text in zip("abcda", ("one is lost",) * 3 + ("two are lost",) * 2, strict=True):
+        for log, text in zip("aabbcda", ("one is lost",) * 5 + ("two are lost",) * 2, strict=True):  # some are read twice
             terminal.logger.warning("%s: %s", log, text)
     assert capsys.readouterr().err.splitlines() == [
         "warning: a: one is lost",
