@@ -14,7 +14,7 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.config import build
-from imutool.errors import DataError
+from imutool.errors import DataError, LogError
 from imutool.file_location import Location
 from imutool.inertial.stationary import CALM, rest_stretches, white_noise
 from imutool.log_info.unit_conversion import in_si_units
@@ -94,10 +94,13 @@ def identify(
     if not isinstance(log, Log):
         with Log(log) as opened:
             return identify(opened, imu=imu, truth=truth, model=model)
-    path, recording = log.path, longest_recording(read_recordings(log, imu=imu, truth=truth, vectors=False))
+    left_out: dict[str, LogError] = {}  # poses: samples at rest need none
+    found = read_recordings(log, imu=imu, truth=truth, vectors=False, refused=None if truth else left_out.__setitem__)
+    path, recording = log.path, longest_recording(found)
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
     recording, remarks = in_si_units(recording)
+    remarks += [f"{topic} is left out: {error.what}" for topic, error in left_out.items()]
     release_memory()
     rest = _at_rest(recording.imu, remarks)
     motion = None
@@ -110,12 +113,8 @@ def identify(
     at_most = dict.fromkeys(SENSORS, UNKNOWN) if rest is None else rest.at_most
     combined = _combine(rest, motion, samples, at_most, period_s, remarks)
     if rest is None and motion is None:
-        raise DataError(
-            f"the log shows no noise: {'; '.join(remarks)}",
-            where=path,
-            expected="a stretch at rest, or true poses",
-            fix="Record the sensor at rest, for hours to see its bias walk",
-        )
+        what, fix = f"the log shows no noise: {'; '.join(remarks)}", "Record the sensor at rest, for hours to see its bias walk"
+        raise DataError(what, where=path, expected="a stretch at rest, or true poses", fix=fix)
     return IdentifiedNoise(recording.name, recording.imu_topic, combined, at_most, samples, rest, motion, remarks)
 
 

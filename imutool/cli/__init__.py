@@ -56,7 +56,7 @@ def main() -> None:
             stream.reconfigure(errors="replace")  # Windows' code page, into which it writes a file, has no root of Hz
     try:
         if words in ([], ["--help"]) and COMPLETION not in os.environ:
-            show()
+            _show()
             sys.exit(0 if words else WRONG_USAGE)
         app = load(() if COMPLETION in os.environ else words)
         from typer import Exit
@@ -78,6 +78,17 @@ def main() -> None:
             if isinstance(end.__context__, Exit) and was_interrupted(end.__context__):
                 raise KeyboardInterrupt from end  # before the command began or after its end, where typer ends without a word
             _leave_pipe(end)
+            raise
+
+
+def _show() -> None:
+    """Print the help page; where it cannot be written, say so."""
+    try:
+        show()
+    except OSError:
+        from imutool.cli.app import caught  # the page itself does without
+
+        with caught():
             raise
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +12,9 @@ from msgspec import convert, field
 
 from imutool.bias_start import Fitness
 from imutool.cli.app import COMMON, Aid, Common, Imu, Init, Logs, Models, ReportPage, Set, Smooth, Truth, Written, app
-from imutool.cli.terminal import figures, say, table
+from imutool.cli.terminal import figures, kept_for_end, raise_kept, say, table
 from imutool.errors import ConfigError, ImutoolError
 from imutool.report import UNSET, Report, Section, UnsetType
-
-logger = logging.getLogger(__name__)
 
 ALIGNED_HELP = (
     "Also print evo's orientation error after an alignment of the positions (SE(3)); it is no measure of the attitude."
@@ -95,8 +92,8 @@ def evaluate(
 ) -> None:
     """Integrate the IMU from the true start, raw and debiased, and compare it with the truth.
 
-    Without --model the debiased samples of the log are scored, if it has them. A model that does not apply to a log is named at
-    the end, after the scores of the others.
+    Without --model the debiased samples of the log are scored, if it has them. A model that does not apply to a log, and
+    a log of several that is not usable, are named at the end, after the scores of the others.
     """
     from imutool.evaluation import evaluate as run
 
@@ -114,16 +111,19 @@ def evaluate(
     with common.progress("Evaluating") as tell:
         for done, log in enumerate(logs):
             tell(done, len(logs), log.name)
-            first = len(results)
             refused: dict[str, ImutoolError] = {}
             read: dict[str, Any] = {"init": init, "smooth": smooth, "truth": truth, "imu": imu}
             more: dict[str, Any] = {"trajectories": trajectories, "overwrite": common.overwrite, "refused": refused.__setitem__}
-            results += run(log, models=model or (), aid=asked, **read, **more)
-            errors += [error.replaced(what=f"the model {name} is not scored: {error.what}") for name, error in refused.items()]
-            if report is not None:
-                scored = [name for name in model or () if name not in refused]
-                run_data = load(log, models=scored, aid=asked, **read)
-                loaded.append(replace(run_data, notes=(*run_data.notes, *_late(results[first:]))))
+            with kept_for_end(errors):
+                found = run(log, models=model or (), aid=asked, **read, **more)
+                errors += [each.replaced(what=f"the model {name} is not scored: {each.what}") for name, each in refused.items()]
+                if report is not None:
+                    scored = [name for name in model or () if name not in refused]
+                    run_data = load(log, models=scored, aid=asked, **read)
+                    loaded.append(replace(run_data, notes=(*run_data.notes, *_late(found))))
+                results += found
+        if not results:
+            raise_kept(errors)
         if report is not None:
             tell(len(logs), len(logs), "drawing")
             pages.write_page(loaded, report, overwrite=common.overwrite)
@@ -133,10 +133,7 @@ def evaluate(
         figures(rows, aligned=aligned)
         for sentence in [*_used(results), *_late(results), *_fits(results), *([] if report is None else [f"Report: {report}"])]:
             say(sentence)
-    for error in errors[1:]:
-        logger.warning("%s", error)
-    if errors:
-        raise errors[0]
+    raise_kept(errors)
 
 
 def _refuse_one_name(logs: Sequence[Path]) -> None:
@@ -147,13 +144,13 @@ def _refuse_one_name(logs: Sequence[Path]) -> None:
 
     known: dict[str, Path] = {}
     for path in logs:
-        with Log(path) as log:
+        with kept_for_end([]), Log(path) as log:  # one that is no log is named later
             own, _ = own_and_user_metadata(log.metadata_records(), "")
-        name = own.get("name", log_name(path))
-        if name in known:
-            what = f"{known[name]} and {path} are both called {name!r}"
-            raise ConfigError(what, where="trajectories", fix="Score them one at a time, each with a folder of its own")
-        known[name] = path
+            name = own.get("name", log_name(path))
+            if name in known:
+                what = f"{known[name]} and {path} are both called {name!r}"
+                raise ConfigError(what, where="trajectories", fix="Score them one at a time, each with a folder of its own")
+            known[name] = path
 
 
 def _fits(results: Sequence[dict[str, Any]]) -> list[str]:
@@ -216,12 +213,15 @@ def vio(
     given |= {"blackout_s": blackout, "seed": seed} | ({} if duration is None else {"duration_s": duration})
     settings = load(VioSettings, None, [*(f"{key}={value}" for key, value in given.items()), *(set_ or ())])
     states = (True, False) if bias_states is None else (bias_states,)
-    results = []
+    results: list[dict[str, Any]] = []
+    errors: list[ImutoolError] = []
+    read: dict[str, Any] = {"init": init, "truth": truth, "imu": imu, "bias_states": states, "settings": settings}
     with common.progress("Estimating") as tell:
         for log in logs:
-            results += run(
-                log, models=model or (), init=init, truth=truth, imu=imu, bias_states=states, settings=settings, progress=tell
-            )
+            with kept_for_end(errors):
+                results += run(log, models=model or (), **read, progress=tell)
+        if not results:
+            raise_kept(errors)
     if common.write(VioReport(results)):
         return
     for rows in tabulate(results):

@@ -11,8 +11,8 @@ import typer
 from msgspec.structs import replace
 
 from imutool.cli.app import COMMON, PNG, TOML, Common, LogUrls, MaxChunk, app
-from imutool.cli.terminal import say, table, tell_losses
-from imutool.errors import LOST, ConfigError
+from imutool.cli.terminal import kept_for_end, raise_kept, say, table, tell_losses
+from imutool.errors import LOST, ConfigError, ImutoolError
 from imutool.file_location import to_location
 from imutool.report import UnsetType, json_values
 
@@ -44,7 +44,10 @@ def info(
     max_chunk: MaxChunk = None,
     common: Common = COMMON,
 ) -> None:
-    """Report the topics, quality and damage of a log; with --noise, also its IMU noise."""
+    """Report the topics, quality and damage of a log; with --noise, also its IMU noise.
+
+    Of several logs, one that cannot be read is named at the end, after the reports of the others.
+    """
     from imutool.log_info.report import LogInfos
 
     asked = {"--model": model, "--imu": imu, "--truth": truth, "--noise-plot": noise_plot, "--noise-toml": noise_toml}
@@ -52,14 +55,22 @@ def info(
         raise ConfigError(f"{idle[0]} needs --noise", where="info", fix="Add --noise")
     if len(logs) > 1 and (noise_plot or noise_toml):
         raise ConfigError(f"{len(logs)} logs do not fit one file", where="--noise-plot, --noise-toml", expected="one log")
-    described = [_described(log, quick, max_chunk, noise, {"imu": imu, "truth": truth, "model": model}) for log in logs]
-    reports = [report for report, _ in described]
-    if (identified := described[0][1]) is not None:
+    settings = {"imu": imu, "truth": truth, "model": model}
+    described: list[tuple[str, LogInfo, IdentifiedNoise | None]] = []
+    errors: list[ImutoolError] = []
+    for log in logs:
+        with kept_for_end(errors):
+            described.append((log, *_described(log, quick, max_chunk, noise, settings)))
+    if not described:
+        raise_kept(errors)
+    reports = [report for _, report, _ in described]
+    if (identified := described[0][2]) is not None:
         _write_noise(identified, noise_plot, noise_toml, common.overwrite)
-    if not common.write(reports[0] if len(reports) == 1 else LogInfos(reports)):
-        for log, (report, identified) in zip(logs, described, strict=True):
+    if not common.write(reports[0] if len(logs) == 1 else LogInfos(reports)):
+        for log, report, identified in described:
             say(f"{log}: {_span(report)}")
             _print(report, identified)
+    raise_kept(errors)
     if any(report.losses["stretches"] for report in reports):
         raise typer.Exit(LOST)
 

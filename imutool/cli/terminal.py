@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from imutool.cli.parameters import with_flags
-from imutool.errors import ConfigError, redact
+from imutool.errors import ConfigError, ImutoolError, redact
 from imutool.file_location import to_location
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.storage.target import Target
@@ -158,29 +158,49 @@ def write_json(report: Report | Mapping[str, Any], where: str | None, *, overwri
     return False
 
 
+@contextmanager
+def kept_for_end(errors: list[ImutoolError]) -> Iterator[None]:
+    """Keep the error of one log for `raise_kept`, not that of a wrong command line."""
+    try:
+        yield
+    except ConfigError:
+        raise
+    except ImutoolError as error:
+        errors.append(error)
+
+
+def raise_kept(errors: Sequence[ImutoolError]) -> None:
+    """Raise the first error, if there is one, and print the others as warnings."""
+    for error in errors[1:]:
+        logger.warning("%s", error)
+    if errors:
+        raise errors[0]
+
+
 class _Lines(logging.Handler):
     """Handler that prints log records on stderr, above the progress bar; what logs in a row have alike in one line more."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._level, self._text, self._others = "", "", list[str]()
+        self._level, self._text, self._logs = "", "", list[str]()
 
     def emit(self, record: logging.LogRecord) -> None:
         log, colon, text = record.getMessage().partition(": ")
         level = record.levelname.lower()
         if colon and (level, text) == (self._level, self._text):
-            self._others.append(log)
+            if log not in self._logs:  # a command may read a log twice
+                self._logs.append(log)
             return
         self.flush()
-        self._level, self._text = level, text
+        self._level, self._text, self._logs = level, text, [log]
         say(with_flags(f"{level}: {record.getMessage()}"), to=err)
 
     def flush(self) -> None:
         """Name the other logs of the last text."""
-        if self._others:
-            more = len(self._others) - 1
-            say(f"{self._level}: {self._others[0]}{f' and {more} other' if more else ''}{'s' * (more > 1)}: the same", to=err)
-        self._level, self._text, self._others = "", "", []
+        if others := self._logs[1:]:
+            more = len(others) - 1
+            say(f"{self._level}: {others[0]}{f' and {more} other' if more else ''}{'s' * (more > 1)}: the same", to=err)
+        self._level, self._text, self._logs = "", "", []
 
 
 def log_to_stderr(verbose: bool, quiet: bool) -> None:

@@ -10,7 +10,8 @@ from typing import Annotated
 import typer
 
 from imutool.cli.app import COMMON, HTML, Aid, Common, Imu, Init, LogUrls, Models, Smooth, Truth, Written, app
-from imutool.cli.terminal import say
+from imutool.cli.terminal import kept_for_end, raise_kept, say
+from imutool.errors import ImutoolError
 from imutool.file_location import to_location
 from imutool.mcap_io.storage import output_conflicts
 from imutool.report import Report
@@ -64,7 +65,7 @@ def view(
     """Show truth, raw and debiased: in the Rerun viewer, in a browser, or as files.
 
     Without one of --save, --connect, --web, --export-web, --png and --html a viewer opens; where it cannot, an .rrd is
-    saved.
+    saved. Of several logs, one that is not usable is named at the end.
     """
     from imutool.viewing.model.load_view import load
     from imutool.viewing.model.trajectory_error import alignment
@@ -77,15 +78,22 @@ def view(
     with Outputs(asked) as outputs:
         with common.progress("Reading") as tell:
             data = []
+            used: list[str] = []
+            errors: list[ImutoolError] = []
             for done, log in enumerate(places):
                 tell(done, len(places), log.name)
-                data.append(read(log))
+                with kept_for_end(errors):
+                    data.append(read(log))
+                    used.append(str(log))
+        if not data:
+            raise_kept(errors)
         shown = outputs.show(data)
-        report = View([str(log) for log in places], shown, **outputs.versions())
+        report = View(used, shown, **outputs.versions())
         if not common.write(report):
             for output in shown:
                 say(output.said)
         sys.stdout.flush()  # whoever reads it through a pipe wants the address now
         if outputs.refused is not None:
             raise outputs.refused
+        raise_kept(errors)
         outputs.serve()

@@ -259,7 +259,8 @@ class _Asl:
 
     def texts(self, given: Noise | None) -> None:
         """The sensor.yaml of the folders written, and body.yaml, where the log kept them."""
-        rate_hz, kept = 1e9 / self._stamps.steps.median(), self._kept("imu0/sensor.yaml")
+        rate_hz, kept = self._stamps.clock().rate_hz, self._kept("imu0/sensor.yaml")
+        assert rate_hz is not None  # two samples or more, whose stamps increase
         self._text("imu0/sensor.yaml", imu_yaml(self.recording, kept, rate_hz, given))
         folders = {name.split("/")[0] for name in self.written}
         for folder in sorted(folders - {"imu0"}):

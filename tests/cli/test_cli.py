@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -99,7 +100,7 @@ def test_a_message_of_many_lines_is_whole(capsys: pytest.CaptureFixture[str]) ->
 
 def test_what_several_logs_in_a_row_have_alike_is_printed_once(capsys: pytest.CaptureFixture[str]) -> None:
     with terminal.progress("Reading", verbose=False, quiet=False):
-        for log, text in zip("abcda", ("one is lost",) * 3 + ("two are lost",) * 2, strict=True):
+        for log, text in zip("aabbcda", ("one is lost",) * 5 + ("two are lost",) * 2, strict=True):  # some are read twice
             terminal.logger.warning("%s: %s", log, text)
     assert capsys.readouterr().err.splitlines() == [
         "warning: a: one is lost",
@@ -222,6 +223,14 @@ def test_a_reader_that_has_left_is_no_error(logs: Path, command: str, words: lis
     finally:
         os.close(writing)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_a_help_page_that_cannot_be_written_is_no_bug(code: Code, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(cli, "show", full)
+    assert code("--help") == errors.ConfigError.exit_code
 
 
 def test_a_command_without_standard_output_does_its_work(logs: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from typer.testing import CliRunner, Result
 from imutool import diagnosis_output
 from imutool.cli import load
 from imutool.cli.train import lines_of_choice
-from imutool.errors import ConfigError, DataError, ModelError
+from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.file_location import identity
 from imutool.fleet import page as fleet_page
 from imutool.fleet.one_log import work
@@ -159,6 +159,20 @@ def test_evaluate_scores_the_other_models_and_names_the_one_that_does_not_apply(
     results = json.loads((tmp_path / "said.json").read_text())["results"]
     assert [row["model"] for row in results] == ["raw", "linear"]
     assert "the model static is not scored" in done.output
+
+
+@pytest.mark.parametrize(("command", "page"), [("info", None), ("evaluate", "--report"), ("view", "--html")])
+def test_of_several_logs_the_sound_ones_are_reported_and_the_other_one_is_named(
+    logs: Path, tmp_path: Path, command: str, page: str | None
+) -> None:
+    none, out = tmp_path / "none.mcap", tmp_path / "out"
+    none.write_text("hello")
+    more = [] if page is None else [page, out.with_suffix(".html")]
+    done = run(command, none, logs / "flight_1.mcap", *more, "--json", out.with_suffix(".json"))
+    assert (done.exit_code, "none.mcap: this is not an MCAP log" in done.stderr) == (LogError.exit_code, True)
+    found = json.loads(out.with_suffix(".json").read_text())
+    assert len(found.get("logs", found.get("results", []))) == 1
+    assert page is None or out.with_suffix(".html").exists()
 
 
 @pytest.mark.parametrize("kept", ["kept", "dropped"])

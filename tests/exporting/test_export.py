@@ -178,6 +178,14 @@ def yaml_of(folder: Path) -> dict[str, object]:
     return dict(YAML(typ="safe").load((folder / "mav0/imu0/sensor.yaml").read_text(encoding="utf-8")))
 
 
+def test_the_rate_of_sensor_yaml_is_that_of_stamps_in_steps_of_a_coarse_clock(tmp_path: Path) -> None:
+    made = flight(5, duration_s=2.0)  # EuRoC's clock has ticks of 256 ns: the median alone gave 200.003 Hz
+    imu = replace(made.imu, t_ns=made.imu.t_ns // 256 * 256)
+    write(replace(made, imu=imu, metadata={}), tmp_path / "log.mcap")
+    export(tmp_path / "log.mcap", tmp_path / "out", format="euroc")
+    assert yaml_of(tmp_path / "out")["rate_hz"] == 200
+
+
 def test_sensor_yaml_says_where_its_noise_is_from(log: Path, tmp_path: Path) -> None:
     export(log, tmp_path / "named", format="euroc")  # the log names its sensor
     held = yaml_of(tmp_path / "named")

@@ -279,6 +279,17 @@ def test_a_sensor_that_rests_all_the_time_has_no_noise_in_motion(tmp_path: Path)
     assert "in motion: the sensor rests nearly all the time" in found.remarks
 
 
+def test_poses_that_cannot_be_used_cost_no_noise_at_rest(tmp_path: Path) -> None:
+    imu = still(20.0)
+    truth = Poses(imu.t_ns, np.zeros((len(imu), 3)), np.tile([1.0, 0.0, 0.0, 0.0], (len(imu), 1)))
+    truth.q_wb_wxyz.setflags(write=True)
+    truth.q_wb_wxyz[:, 0] = 8.0
+    write(Recording("still", imu, truths={"/pose": truth}), tmp_path / "still.mcap")
+    found = identify(tmp_path / "still.mcap")
+    assert found.noise.accel_density == pytest.approx((2e-3,) * 3, rel=2 * DENSITY_TOLERANCE)
+    assert any(remark.startswith("/pose is left out: quaternion [8.0,") for remark in found.remarks)
+
+
 def test_a_log_with_neither_rest_nor_truth_is_refused(tmp_path: Path) -> None:
     imu = still(20.0)
     turning = Imu(imu.t_ns, imu.gyro + np.sin(np.arange(len(imu)) / 50.0)[:, None], imu.accel)
