@@ -32,7 +32,7 @@ def imu_topics(log: Location) -> list[str]:
 
 
 def compared_imu(reals: Sequence[Location], imu: str | None) -> str | None:
-    """IMU whose findings are looked for: the one asked for, or the first of several in one recording."""
+    """Topic of the IMU that is diagnosed: `imu`, or the first of several in one recording."""
     topics = imu_topics(reals[0])
     return imu or (topics[0] if len(topics) > 1 and len(reals) == 1 else None)
 
