@@ -22,6 +22,7 @@ import numpy as np
 from imutool.diagnosis.closed_loop import CLOSED_LOG, ROUNDS, check_metric, closed_loop, figure, is_worth_a_round
 from imutool.diagnosis.diagnose import diagnose as diagnose_logs
 from imutool.diagnosis.estimation.aligned_log import DEFAULT
+from imutool.diagnosis.imu_relation import compared_imu
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.second_simulation import simulate_again
 from imutool.diagnosis.settings import DiagnoseSettings
@@ -121,8 +122,7 @@ def diagnose(
     """Diagnosis of recordings, written to a folder if given; a remark for each file left out.
 
     With `close` its physics is simulated along `sim` or the recording's poses. What is missing against that log begins another
-    search, for some rounds. `metric` is called with `sim` before the search; if it fails with the log that closes the loop, a
-    remark of the diagnosis says so. `names` stand for the paths of logs in what is written.
+    search, for some rounds. `metric` is called with `sim` before it; its failure later is a remark. `names` stand for paths.
 
     Raises:
         ConfigError: as `refuse`; with `close` several recordings, no folder, or an input that is no file or would be replaced;
@@ -134,7 +134,7 @@ def diagnose(
     def look(findings: Path | None = None) -> list[RunData]:
         from imutool.viewing.model.load_view import load
 
-        return [load(real, imu=imu, truth=truth, findings=findings) for real in reals]
+        return [load(real, imu=compared_imu(reals, imu), truth=truth, findings=findings) for real in reals]
 
     if metric is not None:
         check_metric(metric, closes=close and sim is not None)

@@ -30,7 +30,7 @@ from imutool.diagnosis.estimation.trial.effect_forms import in_forms
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.held_out import resimulate
-from imutool.diagnosis.imu_relation import imu_relation, imu_sentence
+from imutool.diagnosis.imu_relation import compared_imu, imu_relation, imu_sentence, imu_topics
 from imutool.diagnosis.reference.another_motion import compared
 from imutool.diagnosis.reference.conventions import with_common_conventions
 from imutool.diagnosis.reference.coverage import (
@@ -52,7 +52,6 @@ from imutool.diagnosis.to_sensor_files import NO_EFFECT, start_values
 from imutool.errors import ImutoolError
 from imutool.file_location import Location
 from imutool.log_info.convention_report import check_one_sensor, check_units, convention_warnings, warn_of_recordings
-from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.processes.forked import Forked
 from imutool.recording import Recording
@@ -91,10 +90,10 @@ def diagnose(
     report, settings = tell or (lambda done, total, text: None), settings or DiagnoseSettings()
     report(0, 4, "reading")
     check_signals(signals, reals, sim)
-    topics = _imu_topics(reals[0])
-    if sim is not None and not (topics and _imu_topics(sim)):
+    topics = imu_topics(reals[0])
+    if sim is not None and not (topics and imu_topics(sim)):
         return with_signals(Diagnosis.without_imu(reals, sim), reals[0], sim, signals, report, settings)
-    first = imu or (topics[0] if len(topics) > 1 and len(reals) == 1 else None)
+    first = compared_imu(reals, imu)
     logs_read = [with_channels(read_log(real, imu=first, truth=truth), real) for real in reals]
     recordings = with_unique_names([log.recording for log in logs_read])
     check_one_sensor(recordings)
@@ -210,11 +209,6 @@ def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: S
         why = f"The gain is computed, not measured with a second simulation. Reason: {error}"
         return replace(diagnosis, remarks=(*diagnosis.remarks, why, *simulator_remarks(sim)))
     return replace(diagnosis, closer=closer)
-
-
-def _imu_topics(path: Location) -> list[str]:
-    with Log(path) as log:
-        return log.imu_topics
 
 
 def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:

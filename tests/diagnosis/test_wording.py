@@ -524,6 +524,11 @@ def test_a_place_of_one_of_several_logs_names_it() -> None:
     assert lines(replace(diagnoses.NOTHING, located=(place,)))[1].startswith(
         "Where: second, accel x, y, angular rate above 0.4"
     )
+    (like,) = diagnoses.NOTHING.traces
+    traces = [replace(like, log=name, path=f"{folder}/real.mcap") for folder, name in (("a", "real"), ("b", "real (2)"))]
+    places = [replace(place, log=trace.path) for trace in traces]
+    said = lines(replace(diagnoses.NOTHING, located=places, traces=traces))
+    assert [line[:22] for line in said[1:]] == ["Where: real, accel x, ", "Where: real (2), accel"]
 
 
 def test_no_unseen_time_is_not_called_unseen() -> None:

@@ -59,21 +59,27 @@ def _with_z_up(pair: Pair) -> Pair:
 
 
 class _Convention(NamedTuple):
-    """Factor and axes P with factor y P = x as far as the motion shows them, and the share of the squares that they leave."""
+    """Factor and axes P with factor y P = x as far as the motion shows them, and the share of the squares that they leave.
+
+    `needed`: the reference's axes leave too much for a turned mount, as an axis that hardly turns never does.
+    """
 
     factor: float
     P: Matrix
     left: float
+    needed: bool
 
     def beside(self, other: _Convention) -> tuple[float, Matrix]:
         """Factor and axes, if they explain the motion; less of it where the other sensor shows the same axes."""
         alike = other.left < EXPLAINED and np.array_equal(self.P, other.P)
-        return self[:2] if self.left < (EXPLAINED_AS_OTHER if alike else EXPLAINED) else (1.0, np.eye(3))
+        if self.left > (EXPLAINED_AS_OTHER if alike else EXPLAINED):
+            return 1.0, np.eye(3)
+        return self.factor, self.P if self.needed or (alike and other.needed) else np.eye(3)
 
 
 def _convention(sensor: Sensor, y: Readings, x: Readings) -> _Convention:
     """Convention that the motion shows best; the same as the reference if gravity or the correlation contradicts it."""
-    same = _Convention(1.0, np.eye(3), np.inf)
+    same = _Convention(1.0, np.eye(3), np.inf, needed=False)
     if len(y) == 0 or not y.any():
         return same
     like = Hypotheses(x[:, :, None], x[:, :, None], free_bias=sensor == "gyro")
@@ -85,7 +91,8 @@ def _convention(sensor: Sensor, y: Readings, x: Readings) -> _Convention:
     size = max(float((x**2).mean(axis=0).sum()), np.finfo(np.float64).tiny)
     shown = sensor == "gyro" or float((left.mean(axis=0) ** 2).sum()) < CONSTANT * size
     shown &= _correlation(turned, x) > _correlation(y, x) - UNLIKE
-    return _Convention(factor, P, float(left.var(axis=0).sum()) / size) if shown else same
+    needed = float((factor * y - x).var(axis=0).sum()) > EXPLAINED * float(x.var(axis=0).sum())
+    return _Convention(factor, P, float(left.var(axis=0).sum()) / size, needed) if shown else same
 
 
 def _correlation(y: Readings, x: Readings) -> float:

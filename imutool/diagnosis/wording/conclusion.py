@@ -107,7 +107,7 @@ def table(d: Diagnosis) -> list[list[str]]:
 def below(d: Diagnosis) -> list[str]:
     """Lines below the findings: locations, gain, remarks."""
     out = [MEASURE] if any(has_gain(finding) for finding in d.findings) else []
-    out += [f"Where: {location_text(place)}; {percent(place.share)} of the misfit" for place in d.located]
+    out += [f"Where: {location_text(place, d)}; {percent(place.share)} of the misfit" for place in d.located]
     if d.findings and d.closer:
         closer = "; ".join(f"{signal} {improvement(gain)}" for signal, gain in d.closer.items())
         out.append(f"{gain_source(d)}{held_out_time(d)}: {closer}")
@@ -143,11 +143,20 @@ def improvement(closer: Closer) -> str:
     return f"{rms_text(closer)}, {percent(closer.share)} of the misfit removed"
 
 
-def location_text(place: Located) -> str:
-    """Location as text: `accel x, y, angular rate above 0.4 rad/s, 12.0 to 48.5 s`."""
+def location_text(place: Located, d: Diagnosis | None = None) -> str:
+    """Location as text: `accel x, y, angular rate above 0.4 rad/s, 12.0 to 48.5 s`.
+
+    `d` gives logs the names of its figures.
+    """
+    names = {trace.path: trace.log for trace in d.traces if trace.path} if d is not None else {}
     spans = [f"{first:.1f} to {last:.1f} s" for first, last in place.intervals_s]
     shown = spans if len(spans) <= SHOWN else [*spans[: SHOWN - 1], f"{len(spans) - SHOWN + 1} more stretches"]
-    parts = (Path(place.log).stem, f"{place.signal} {', '.join(place.axes)}".rstrip(), place.regime, *shown)
+    parts = (
+        names.get(place.log, Path(place.log).stem),
+        f"{place.signal} {', '.join(place.axes)}".rstrip(),
+        place.regime,
+        *shown,
+    )
     return ", ".join(part for part in parts if part)
 
 

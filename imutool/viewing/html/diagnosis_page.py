@@ -135,7 +135,7 @@ def _locations(d: Diagnosis) -> Iterator[str]:
         return
     yield "<h2>Location of the misfit</h2>"
     rows = "".join(
-        f"<tr><td>{text(location_text(located))}</td><td class=number>{percent(located.share)}</td></tr>"
+        f"<tr><td>{text(location_text(located, d))}</td><td class=number>{percent(located.share)}</td></tr>"
         for located in d.located
     )
     head = "<tr><th>Signal, regime, time</th><th>Share of the misfit</th></tr>"

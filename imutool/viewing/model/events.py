@@ -142,7 +142,7 @@ class _Unit(msgspec.Struct, tag_field="schema", tag="imutool.unit/1"):
 
 
 def finding_events(folder: Path, log: str, start_ns: int, end_ns: int) -> tuple[list[Event], list[str]]:
-    """Events of the located findings of a log (by file name), and notes on the others.
+    """Events of the located findings of a log (by path or name), and notes on the others.
 
     `folder` is of a diagnosis, or the file that a fleet's diagnosis writes for one log. Times of a place count from the start
     of its log, or of the first where it names none. What is located without a time acts everywhere. Of a place with more
@@ -154,8 +154,11 @@ def finding_events(folder: Path, log: str, start_ns: int, end_ns: int) -> tuple[
     """
     diagnosis = _read(folder if folder.is_file() else folder / FINDINGS)
     first = diagnosis.real[0] if diagnosis.real else "no log"
+    path, log = log, Path(log).name
     own = log, Path(log).stem  # of a recording of arrays a diagnosis holds the name
     here = [place for place in diagnosis.located if Path(place.log or first).name in own]
+    if path in diagnosis.real:
+        here = [place for place in here if (place.log or first) == path]
     if Path(first).name not in own and not here:
         return [], [f"The findings of {folder.name} are on the clock of {Path(first).name} and are not marked in {log}."]
     events, notes = [], []

@@ -77,7 +77,7 @@ def load(
     with_models, aided, origins = _with_models(recording, models, init, str(log), smooth, aids, notes)
     if findings is not None:
         start_ns, end_ns = int(recording.imu.t_ns[0]), int(recording.imu.t_ns[-1])
-        more_events, more_notes = finding_events(findings, log.name, start_ns, end_ns)
+        more_events, more_notes = finding_events(findings, str(log), start_ns, end_ns)
         events, notes = [*events, *more_events], [*notes, *more_notes]
     raw = Run.raw(recording.imu)
     if aids is not None:

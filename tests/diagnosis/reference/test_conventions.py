@@ -79,6 +79,18 @@ def test_axes_that_the_motion_does_not_tell_apart_stay() -> None:
     assert with_common_conventions([replace(flat, real=swapped)])[1] == []
 
 
+@pytest.mark.parametrize(("tilt", "y", "named"), [(-0.04, 1.0, []), (0.0, -1.0, [("left_handed", "both")])])
+def test_an_axis_that_hardly_turns_is_mirrored_only_if_the_accel_shows_it(tilt: float, y: float, named: list) -> None:
+    """Fetch 04_eight turns about z: what a tilt of its mount adds to y was more than y turns, and the other way."""
+    flat, turn = planted.planar(SECONDS), np.diag([1.0, y, 1.0])
+    leaning = replace(flat, gyro=flat.gyro + 0.02 * flat.gyro[:, 2:] * [0.0, 1.0, 0.0])
+    pair = planted.pair(leaning, {"mount_rotation": [tilt, 0.0, 0.0]})
+    read = np.concatenate([pair.real[:, :3] @ turn, pair.real[:, 3:] @ turn], axis=1)
+    (after,), found = with_common_conventions([replace(pair, real=read)])
+    assert [(one.effect, one.signal) for one in found] == named
+    assert after.real == pytest.approx(pair.real)
+
+
 @pytest.mark.parametrize("z", [1.0, -1.0])
 def test_gravity_is_up_in_the_world_of_both_logs(z: float) -> None:
     """In a world whose z is down, as a simulator in NED has it, more gravity was less of it."""

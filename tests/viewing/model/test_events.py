@@ -171,6 +171,13 @@ def test_findings_act_where_they_were_located(tmp_path: Path) -> None:
     assert events[2].text == "gyro z: driven (/motor.data)"
 
 
+def test_findings_of_another_log_of_the_same_file_name_stay_there(tmp_path: Path) -> None:
+    real = ["a/drive.mcap", "b/drive.mcap"]
+    located = [{"signal": "gyro", "axes": [], "intervals_s": [], "regime": log, "share": None, "log": log} for log in real]
+    events, notes = finding_events(folder(tmp_path, real=real, located=located), real[1], START_NS, END_NS)
+    assert ([event.text.split(":")[0] for event in events], notes) == (["gyro, b/drive.mcap"], [])
+
+
 def test_findings_without_a_place_are_told(tmp_path: Path) -> None:
     events, notes = finding_events(folder(tmp_path, located=[]), "drive.mcap", START_NS, END_NS)
     assert events == []
