@@ -181,8 +181,15 @@ def rest_differences(
     return out
 
 
+def stops_in(samples: Samples) -> list[tuple[float, float]]:
+    """Beginning and end (s) of each stop in samples."""
+    t_s, gyro, accel = samples
+    stops = rest_stretches(Imu(np.round(t_s * 1e9).astype(np.int64), gyro, accel))
+    return [(float(t_s[first]), float(t_s[last - 1])) for first, last in stops]
+
+
 def changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], prior: BiasPrior) -> Iterator[str]:
-    """Sentence on a gyro whose mean at rest moves further than the walk of the training runs."""
+    """Sentence on a gyro whose mean at rest moves further than its walk by the prior."""
     t_s, gyro, _ = samples
     within = [gyro[slice(*np.searchsorted(t_s, stop))] for stop in stops]
     for (stop, first), (later, last) in itertools.pairwise(zip(stops, within, strict=True)):
@@ -194,7 +201,7 @@ def changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], prio
         if abs(change[axis]) > MOST_DEVIATIONS * std[axis]:
             yield (
                 f"the gyro's bias about {'xyz'[axis]} moves by {change[axis]:+.2g} rad/s in {apart_s:.0f} s, from stop to stop,"
-                f" {abs(change[axis]) / std[axis]:.0f} standard deviations of its walk in training: it warms up, or drifts"
+                f" {abs(change[axis]) / std[axis]:.0f} standard deviations of its usual walk: it warms up, or drifts"
             )
             return
 
