@@ -45,7 +45,8 @@ PIECE = 512  # samples, of which the search for a stop takes no more than it nee
 def auto(model: BiasModel, imu: Imu) -> InitialBias:
     """Bias from the first stop of the first minute and the training runs, then tracked.
 
-    Samples up to the end of that stop get the bias that all of them show. Later ones get that of the samples before them.
+    Samples up to the end of that stop get the bias that all of them show, smoothed where it moves. Later ones get that of the
+    samples before them.
 
     Raises:
         DataError: an untrained model, and the log does not start at rest.
@@ -67,7 +68,8 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
         before = replace(before, std=wide)
         # a stop of a single block ends before the filter closes it: take as many blocks of the log itself
         blocks = list(itertools.islice(filter_blocks(model, _pieces(imu), before), len(blocks)))
-    track = None if blocks[0].resting else smooth_bias(model, [(t_s, gyro, accel)], before).track
+    constant = blocks[0].resting and not _drifts(gyro[at_stop])
+    track = None if constant else smooth_bias(model, [(t_s, gyro, accel)], before).track
     last = [blocks[-1].step.after] * 2
     (rest, _), (_, P) = before.supported(last, np.full(2, end_s), np.array([True, False]))
     std = np.sqrt(np.diag(P))  # in motion, where the bias is used
@@ -94,6 +96,13 @@ def _pieces(imu: Imu) -> Iterator[Samples]:
     for first in range(0, len(t_s), PIECE):
         rows = slice(first, first + PIECE)
         yield t_s[rows], gyro[rows], accel[rows]
+
+
+def _drifts(gyro: Float64[np.ndarray, "n 3"]) -> bool:
+    """Whether the mean of a gyro at rest moves from the first third of a stop to the last, as while it warms up."""
+    first, _, last = np.array_split(gyro, 3)
+    noise = np.sqrt(2.0 * gyro.var(axis=0) / max(len(first), 1))
+    return bool((np.abs(last.mean(axis=0) - first.mean(axis=0)) > MOST_UNKNOWN + MOST_DEVIATIONS * noise).any())
 
 
 def _at_rest_variance(model: BiasModel, samples: Float64[np.ndarray, "n 6"]) -> Vector6:
