@@ -39,6 +39,7 @@ from imutool.recording.columns import true_ranges
 LOOK_AHEAD_S = 60.0  # in which a log that begins in motion may stop: what the start of a command reads
 REST_BEGINS_WITHIN_S = 5.0  # a later stop would give a bias from the future
 MOST_UNKNOWN = 1e-3  # rad/s, deviation of a bias that may be left unknown: 3 degrees in a minute
+UNTRAINED = BiasPrior(np.zeros(6), np.full(6, np.inf), np.full(6, MOST_UNKNOWN))  # of the change from stop to stop
 PIECE = 512  # samples, of which the search for a stop takes no more than it needs
 
 

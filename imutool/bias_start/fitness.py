@@ -26,8 +26,8 @@ import numpy as np
 from imutool.bias import static
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias.model_file import library, shipped_for
-from imutool.bias_start import Fitness, Verdict
-from imutool.bias_start.bias_at_rest import MOST_UNKNOWN, changed_at_rest, shown_at_rest, stops_in
+from imutool.bias_start import Fitness
+from imutool.bias_start.bias_at_rest import MOST_UNKNOWN, UNTRAINED, changed_at_rest, shown_at_rest, stops_in
 from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_together, stops_of
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
 from imutool.bias_start.prior_width import (
@@ -58,7 +58,6 @@ MOST_RATE = 2e-3  # relative difference of sample rates; one unit's clock stays 
 HALF, MOST_SHARE = 0.5, 1.5  # of a correction: between them it does more good than harm
 LEAST_SHARE = -2.0  # below, the log lacks so much else that the correction makes it worse by less than half
 LEAST_SHOWN = 0.005  # deviation of a share that a percentage shows
-UNTRAINED = BiasPrior(np.zeros(6), UNKNOWN_STD, np.full(6, MOST_UNKNOWN))
 SURE, OWN = 3.0, 4.0  # standard deviations; of made-up sensors' own shares, the largest lies 3.8 from one
 
 
@@ -135,9 +134,9 @@ def _untrained(start: InitialBias, samples: Samples) -> Fitness:
     """Fitness of a constant bias, which needs no training, from the stops of a log."""
     units = sorted({path.stem.rpartition("-")[0] for path in library().glob("*.safetensors")})
     other_start, harmful = contradicted_start(start.rest, start.std, *shown_at_rest(samples))
-    doubts = [*other_start, *changed_at_rest(samples, stops_in(samples), UNTRAINED)]
-    verdict: Verdict = "unfit" if harmful else "doubtful" if doubts else "fits"
-    return Fitness(verdict, (*doubts, f"it needs no training; trained models ship for {', '.join(units)}"))
+    doubts = (*other_start, *changed_at_rest(samples, stops_in(samples), UNTRAINED))
+    trained = f"it needs no training; trained models ship for {', '.join(units)}"
+    return Fitness("unfit" if harmful else "doubtful" if doubts else "fits", (*doubts, trained))
 
 
 def _prior(model: BiasModel) -> BiasPrior:
