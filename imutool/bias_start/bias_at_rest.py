@@ -39,13 +39,15 @@ from imutool.recording.columns import true_ranges
 LOOK_AHEAD_S = 60.0  # in which a log that begins in motion may stop: what the start of a command reads
 REST_BEGINS_WITHIN_S = 5.0  # a later stop would give a bias from the future
 MOST_UNKNOWN = 1e-3  # rad/s, deviation of a bias that may be left unknown: 3 degrees in a minute
+UNTRAINED = BiasPrior(np.zeros(6), np.full(6, np.inf), np.full(6, MOST_UNKNOWN))  # of the change from stop to stop
 PIECE = 512  # samples, of which the search for a stop takes no more than it needs
 
 
 def auto(model: BiasModel, imu: Imu) -> InitialBias:
     """Bias from the first stop of the first minute and the training runs, then tracked.
 
-    Samples up to the end of that stop get the bias that all of them show. Later ones get that of the samples before them.
+    Samples up to the end of that stop get the bias that all of them show, smoothed where it moves. Later ones get that of the
+    samples before them.
 
     Raises:
         DataError: an untrained model, and the log does not start at rest.
@@ -67,7 +69,8 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
         before = replace(before, std=wide)
         # a stop of a single block ends before the filter closes it: take as many blocks of the log itself
         blocks = list(itertools.islice(filter_blocks(model, _pieces(imu), before), len(blocks)))
-    track = None if blocks[0].resting else smooth_bias(model, [(t_s, gyro, accel)], before).track
+    constant = blocks[0].resting and not _drifts(gyro[at_stop])
+    track = None if constant else smooth_bias(model, [(t_s, gyro, accel)], before).track
     last = [blocks[-1].step.after] * 2
     (rest, _), (_, P) = before.supported(last, np.full(2, end_s), np.array([True, False]))
     std = np.sqrt(np.diag(P))  # in motion, where the bias is used
@@ -94,6 +97,13 @@ def _pieces(imu: Imu) -> Iterator[Samples]:
     for first in range(0, len(t_s), PIECE):
         rows = slice(first, first + PIECE)
         yield t_s[rows], gyro[rows], accel[rows]
+
+
+def _drifts(gyro: Float64[np.ndarray, "n 3"]) -> bool:
+    """Whether the mean of a gyro at rest moves from the first third of a stop to the last, as while it warms up."""
+    first, _, last = np.array_split(gyro, 3)
+    noise = np.sqrt(2.0 * gyro.var(axis=0) / max(len(first), 1))
+    return bool((np.abs(last.mean(axis=0) - first.mean(axis=0)) > MOST_UNKNOWN + MOST_DEVIATIONS * noise).any())
 
 
 def _at_rest_variance(model: BiasModel, samples: Float64[np.ndarray, "n 6"]) -> Vector6:
@@ -181,8 +191,15 @@ def rest_differences(
     return out
 
 
+def stops_in(samples: Samples) -> list[tuple[float, float]]:
+    """Beginning and end (s) of each stop in samples."""
+    t_s, gyro, accel = samples
+    stops = rest_stretches(Imu(np.round(t_s * 1e9).astype(np.int64), gyro, accel))
+    return [(float(t_s[first]), float(t_s[last - 1])) for first, last in stops]
+
+
 def changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], prior: BiasPrior) -> Iterator[str]:
-    """Sentence on a gyro whose mean at rest moves further than the walk of the training runs."""
+    """Sentence on a gyro whose mean at rest moves further than its walk by the prior."""
     t_s, gyro, _ = samples
     within = [gyro[slice(*np.searchsorted(t_s, stop))] for stop in stops]
     for (stop, first), (later, last) in itertools.pairwise(zip(stops, within, strict=True)):
@@ -194,7 +211,7 @@ def changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], prio
         if abs(change[axis]) > MOST_DEVIATIONS * std[axis]:
             yield (
                 f"the gyro's bias about {'xyz'[axis]} moves by {change[axis]:+.2g} rad/s in {apart_s:.0f} s, from stop to stop,"
-                f" {abs(change[axis]) / std[axis]:.0f} standard deviations of its walk in training: it warms up, or drifts"
+                f" {abs(change[axis]) / std[axis]:.0f} standard deviations of its usual walk: it warms up, or drifts"
             )
             return
 

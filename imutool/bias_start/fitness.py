@@ -26,8 +26,8 @@ import numpy as np
 from imutool.bias import static
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias.model_file import library, shipped_for
-from imutool.bias_start import Fitness, Verdict
-from imutool.bias_start.bias_at_rest import MOST_UNKNOWN, changed_at_rest, shown_at_rest
+from imutool.bias_start import Fitness
+from imutool.bias_start.bias_at_rest import MOST_UNKNOWN, UNTRAINED, changed_at_rest, shown_at_rest, stops_in
 from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_together, stops_of
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
 from imutool.bias_start.prior_width import (
@@ -134,8 +134,9 @@ def _untrained(start: InitialBias, samples: Samples) -> Fitness:
     """Fitness of a constant bias, which needs no training, from the stops of a log."""
     units = sorted({path.stem.rpartition("-")[0] for path in library().glob("*.safetensors")})
     other_start, harmful = contradicted_start(start.rest, start.std, *shown_at_rest(samples))
-    verdict: Verdict = "unfit" if harmful else "doubtful" if other_start else "fits"
-    return Fitness(verdict, (*other_start, f"it needs no training; trained models ship for {', '.join(units)}"))
+    doubts = (*other_start, *changed_at_rest(samples, stops_in(samples), UNTRAINED))
+    trained = f"it needs no training; trained models ship for {', '.join(units)}"
+    return Fitness("unfit" if harmful else "doubtful" if doubts else "fits", (*doubts, trained))
 
 
 def _prior(model: BiasModel) -> BiasPrior:

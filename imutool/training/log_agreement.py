@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from imutool.array_types import Float64
 from imutool.bias.model import COLUMNS
-from imutool.bias_start.prior_width import turned_axes
+from imutool.bias_start.prior_width import MOST_CHANGE, turned_axes
 from imutool.errors import DataError
 from imutool.recording import nanoseconds
 from imutool.training.bias_spread import TURN_ON_STD
@@ -22,6 +24,8 @@ MOST_LEFT = (
     0.02  # share of chi-square that turned axes leave; of made-up sensors that turn on 10 to 20 mrad/s apart, 1 in 5000 has it
 )
 LONG_ENOUGH_S = 40.0  # for a calibration of a log alone: shorter logs fit their noise
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ class Contradiction:
 
 
 def check_axes(pool: Pool, fits: Mapping[Sensor, Calibration]) -> None:
-    """Refuse a log whose axes are turned against those of the others.
+    """Refuse a log whose axes are turned against the others', and name one of another unit.
 
     Gravity and poses contradict no such log, and scales are the same in axes turned by half a turn: its bias shows it.
 
@@ -61,6 +65,19 @@ def check_axes(pool: Pool, fits: Mapping[Sensor, Calibration]) -> None:
         for what in turned_axes(bias[log] - mean, np.hypot(std, others.std(axis=0)), mean, MOST_LEFT):
             fix = "Turn its axes, or leave it out" if len(others) > 1 else "Turn the axes of one of the two"
             raise DataError(what, where=name, expected="the axes of the other logs", fix=fix)
+    if len(pool.names) > 2:  # of two it could be either
+        _name_other_units(pool.names, bias[:, :3])
+
+
+def _name_other_units(names: Sequence[str], bias: Float64[np.ndarray, "logs 3"]) -> None:
+    """Warn of logs whose gyro has a bias that no switching-on of the others' unit gives."""
+    usual = np.median(bias, axis=0)
+    for name, own in zip(names, bias, strict=True):
+        axis = int(np.argmax(np.abs(own - usual)))
+        if abs(own[axis] - usual[axis]) > MOST_CHANGE[axis]:
+            what = "%s: the gyro's bias about %s is %+.2g rad/s, the median of all logs %+.2g: another unit? %s"
+            fix = "Train a model for each unit"
+            logger.warning(what, name, "xyz"[axis], own[axis], usual[axis], fix)
 
 
 def contradicting(pool: Pool, fits: Mapping[Sensor, Calibration]) -> tuple[Contradiction, ...]:

@@ -231,15 +231,17 @@ def test_an_unfit_model_is_refused_unless_forced_and_a_doubtful_one_is_used(
     assert "the model own is doubtful: " in caplog.text
 
 
-def test_a_bias_that_moves_from_stop_to_stop_is_doubtful(model: BiasModel) -> None:
+@pytest.mark.parametrize(("untrained", "moved"), [(False, 0.008), (True, 0.01)])
+def test_a_bias_that_moves_from_stop_to_stop_is_doubtful(untrained: bool, moved: float, model: BiasModel) -> None:
     """A flight from rest, and the same backwards: at rest again, where the gyro shows what moved."""
     imu, bias = flight(3, duration_s=30.0).imu, model.prior_mean
+    model = static.Model() if untrained else model
     gyro, accel = imu.gyro - bias[:3], imu.accel - bias[3:]
     t_ns = imu.t_ns[0] + np.diff(imu.t_ns[:2]) * np.arange(2 * len(imu) - 1)
     there = np.concatenate([gyro, -gyro[-2::-1]]), np.concatenate([accel, accel[-2::-1]])
     still, drifts = (
-        judged(model, Imu(t_ns, there[0] + bias[:3] + moved * np.linspace(0.0, 1.0, len(t_ns))[:, None], there[1] + bias[3:]))
-        for moved in (0.0, 0.008)
+        judged(model, Imu(t_ns, there[0] + bias[:3] + by * np.linspace(0.0, 1.0, len(t_ns))[:, None], there[1] + bias[3:]))
+        for by in (0.0, moved)
     )
     assert "from stop to stop" not in " ".join(still.reasons)
     assert drifts.verdict == "doubtful"

@@ -657,3 +657,14 @@ def test_a_start_does_not_share_memory_with_the_model() -> None:
     start.rest[:] = 9.0
     assert isinstance(start, InitialBias)
     assert prior(made).rest.tolist() == [pytest.approx(0.1)] * 6
+
+
+def test_a_bias_that_warms_up_during_the_first_stop_is_followed_there() -> None:
+    """The bias at the end of a stop of 20 s was that of all of it."""
+    rng, t_s = np.random.default_rng(0), np.arange(0.0, 24.0, 0.01)
+    drift = 0.01 * np.minimum(t_s, 20.0)[:, None] / 20.0 * [1.0, -0.7, 0.5]
+    gyro = drift + 1e-3 * rng.normal(size=(len(t_s), 3)) + np.where(t_s > 20.0, np.sin(3.0 * t_s), 0.0)[:, None]
+    imu = Imu((1e9 * t_s).astype(np.int64), gyro, [0.0, 0.0, GRAVITY_M_S2] + 0.01 * rng.normal(size=gyro.shape))
+    model = static.Model()
+    bias = auto(model, imu).stream(model)(t_s, imu.gyro, imu.accel)
+    assert np.abs(bias[:, :3] - drift)[t_s < 19.0].max() < 1e-3

@@ -164,14 +164,23 @@ def test_logs_that_need_no_matrix_contradict_nothing() -> None:
         assert not contradictions([log(seed, 0, kind) for seed in range(first, first + 4)])
 
 
-@pytest.mark.parametrize("axes", [np.diag([1.0, -1.0, -1.0]), np.eye(3)], ids=["turned", "as the others"])
-def test_a_log_in_turned_axes_is_refused_though_its_scale_agrees(axes: np.ndarray) -> None:
-    """As of a driver in FRD among logs in FLU: poses and gravity agree with each, and a scale is the same in both."""
+@pytest.mark.parametrize(
+    ("axes", "more"),
+    [(np.diag([1.0, -1.0, -1.0]), 0.0), (np.eye(3), 0.0), (np.eye(3), 0.1)],
+    ids=["turned", "as the others", "another unit"],
+)
+def test_a_log_in_turned_axes_is_refused_though_its_scale_agrees(
+    axes: np.ndarray, more: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As of a driver in FRD among logs in FLU: poses and gravity agree with each, and a scale is the same in both.
+
+    A bias that no switching-on changes so much is named.
+    """
     bias = np.array([0.03, 0.02, -0.03, 0.6, -0.7, 0.6])
     logs = []
     for seed in range(3):
         one, P = log(seed, 0, KIND), axes if seed == 1 else np.eye(3)
-        imu = replace(one.imu, gyro=(one.imu.gyro + bias[:3]) @ P, accel=(one.imu.accel + bias[3:]) @ P)
+        imu = replace(one.imu, gyro=(one.imu.gyro + bias[:3] + more * (seed == 1)) @ P, accel=(one.imu.accel + bias[3:]) @ P)
         q_wb = Rotation.from_quat(one.truth.q_wb_wxyz, scalar_first=True) * Rotation.from_matrix(P)
         poses = replace(one.truth, q_wb_wxyz=q_wb.as_quat(scalar_first=True))
         logs.append(replace(one, name=f"log {seed}", imu=imu, truths={"/ground_truth/pose": poses}))
@@ -180,6 +189,7 @@ def test_a_log_in_turned_axes_is_refused_though_its_scale_agrees(axes: np.ndarra
     fits = {"gyro": gyro, "accel": calibrate(pool, "accel", pool.gyro - gyro.own[pool.log, :3], LINEAR["accel"])}
     if axes[1, 1] > 0.0:
         check_axes(pool, fits)
+        assert [message[:5] for message in caplog.messages if "another unit?" in message] == ["log 1"] * (more > 0.0)
         return
     with pytest.raises(DataError, match=r"^log 1: its bias is .* \+x -y -z: the axes are turned"):
         check_axes(pool, fits)
