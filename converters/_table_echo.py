@@ -52,7 +52,7 @@ def long_table(text: str, path: Path) -> tuple[str, int]:
 
 
 def of_long(text: str) -> tuple[str, int]:
-    """A long table as a row for each time, and how many are left out; empty of other text.
+    """A long table as a row for each time, and how many are left out; nothing of other text.
 
     Its signals share their times, and none has two values at one time.
     """

@@ -124,7 +124,7 @@ def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[st
             found = match.groupdict()
             owner = f"{re.sub(r'^(?=[0-9])', 'imu', found['place'])}_" if "place" in found else found.get("of", "")
             group = groups.setdefault((owner + found["sensor"], found.get("state", "")), {})
-            axis = found["axis"] if "axis" in found else "xyz456789"[int(found["nth"]) - 1]
+            axis = found["axis"] if "axis" in found else "xyz456789"[int(found["nth"]) - 1]  # with a fourth it is no vector
             group[axes.get(axis, axis)] = column
     whole = {key: group for key, group in groups.items() if set(group) == set("xyz")}
     whole = {(name, state): group for (name, state), group in whole.items() if not state or (name, "") not in whole}

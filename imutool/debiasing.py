@@ -238,8 +238,8 @@ def _debias(
     given = dict(options.model) if isinstance(options.model, Mapping) else {} if options.model is None else {"": options.model}
     topics = model_choice.choose_imus(log, options.imus, given)
     check_new_topics(log, {topic: new_topics(topic) for topic in topics})
-    done = [f"by {by}" for by in [log.metadata().get("imutool", {}).get(DEBIASED_BY)] if by]
-    done += [f"as {topic}" for topic in topics if topic in log.topics and log.topics[topic].is_derived]
+    by = log.metadata().get("imutool", {}).get(DEBIASED_BY)
+    done = [f"by {by}"] if by else [f"as {name}" for name in topics if name in log.topics and log.topics[name].is_derived]
     if done and not options.force:
         raise LogError(f"its IMU is debiased already, {done[0]}", where=source, fix="Start from the raw log, or set `force`")
     log.keep(topics)

@@ -122,7 +122,7 @@ def diagnose(
     """Diagnosis of recordings, written to a folder if given; a remark for each file left out.
 
     With `close` its physics is simulated along `sim` or the recording's poses. What is missing against that log begins another
-    search, for some rounds. `metric` is called with `sim` before it; its failure later is a remark. `names` stand for paths.
+    search, for some rounds. `metric` is called with `sim` first; if it fails later, a remark says so. `names` replace paths.
 
     Raises:
         ConfigError: as `refuse`; with `close` several recordings, no folder, or an input that is no file or would be replaced;

@@ -87,7 +87,7 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
         if known[at].sum() > 1
     ]
     usual = model.truth_std**2 * (TRUTH_S / length_s) ** 2
-    variance = _variance(usual, thirds, _by_calibration(model, piece, parts[1:]))
+    variance = _variance(usual, thirds, _by_calibration(model, piece, parts[1:])) if len(thirds) == PARTS else usual
     if not truth.has_positions:
         offset[3:], variance[3:] = 0.0, NOT_SEEN**2
     start = replace(start, std=supported_std(start.std, start.least, offset, variance + WORLD_TILT_STD**2))
@@ -117,15 +117,14 @@ def _variance(usual: Vector6, thirds: Sequence[Vector6], by_calibration: Vector6
 
     Poses of a log may be worse than those of the training logs: markers are exchanged, a clock wanders. The usual variance of a
     third is 9 (errors that last) to 27 times (white ones) as large. Errors that contradict it are taken to last even longer:
-    the variance of the whole is a third of what the thirds show. `by_calibration` is what another motion in each third may do.
+    the variance of the whole is a third of what the thirds show. `by_calibration` is the variance among thirds that the model's
+    calibration allows, because the body moves otherwise in each.
     """
-    variance = usual.copy()
-    if len(thirds) == PARTS:
-        least = PARTS**2.5 * (np.maximum(usual, LEAST_TRUTH_STD**2) + WORLD_TILT_STD**2) + by_calibration
-        shown = np.var(thirds, axis=0, ddof=1)
-        for axes in COLUMNS.values():
-            if (PARTS - 1) * (shown[axes] / least[axes]).sum() > CONTRADICTED:
-                variance[axes] = np.maximum(usual[axes], np.maximum(shown[axes], shown[axes].mean()) / PARTS)
+    variance, shown = usual.copy(), np.var(thirds, axis=0, ddof=1)
+    least = PARTS**2.5 * (np.maximum(usual, LEAST_TRUTH_STD**2) + WORLD_TILT_STD**2) + by_calibration
+    for axes in COLUMNS.values():
+        if (PARTS - 1) * (shown[axes] / least[axes]).sum() > CONTRADICTED:
+            variance[axes] = np.maximum(usual[axes], np.maximum(shown[axes], shown[axes].mean()) / PARTS)
     return variance
 
 

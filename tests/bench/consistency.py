@@ -84,11 +84,14 @@ def main() -> None:
     parser.add_argument("--each-log", action="store_true")
     parser.add_argument("--factor", action="store_true")
     parser.add_argument("--learned", action="store_true")
+    parser.add_argument("--turn-error", type=float, help="share of a turn, in place of the calibration's own")
     options = parser.parse_args()
     found: dict[tuple[str, str], list[Judgement]] = defaultdict(list)
     starts = options.start or STARTS
     cases = made_up(options.made_up) if options.made_up else recorded(options.logs, options.model)
     for case in cases:
+        if options.turn_error:
+            case.model.card = {**case.model.card, "turn_error": options.turn_error}
         for start in starts:
             for quantity, one in judged(case, start):
                 found[start, quantity].append(one)

@@ -68,7 +68,7 @@ def main() -> None:
     for left_out in logs:
         model = learned([r for r in logs if r is not left_out], options.set)
         if options.turn_error:
-            model.card["turn_error"] = options.turn_error
+            model.card = {**model.card, "turn_error": options.turn_error}
         scored = replace(left_out, imu=moved(left_out.imu, rng)) if options.switched_on_again else left_out
         table.append([aoe(model, scored, start) for start in starts])
         found = ", ".join((*(model.config.gyro_effects or ()), *(model.config.accel_effects or ())))

@@ -51,8 +51,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", type=Path, nargs="+", metavar="LOG")
     parser.add_argument("--model", type=Path, required=True)
+    parser.add_argument("--turn-error", type=float, help="share of a turn, in place of the calibration's own")
     options = parser.parse_args()
     model = load(options.model)
+    if options.turn_error:
+        model.card = {**model.card, "turn_error": options.turn_error}
     logs = recordings(options.logs)
     oracle = own_bias(model, logs)
     print(f"{'':16}" + "".join(f"{column:>9}" for column in COLUMNS) + "   s: auto, smooth; how")

@@ -48,8 +48,8 @@ def _speed(pool: Pool) -> dict[str, Any]:
 def _turn_error(model: BiasModel, pool: Pool) -> dict[str, float]:
     """Error of a turn as a share of it, by the calibration's covariance in the motion of the training logs.
 
-    A constant part of it is a bias, which the filter estimates. The filter takes the errors of blocks for independent, so
-    that of all axes counts for each of them.
+    A constant part of it is a bias, which the filter estimates. The filter takes the errors of its half seconds for
+    independent. They are not, so the error of all axes together counts for each axis.
     """
     error = turned = 0.0
     for log in range(len(pool.names)):
