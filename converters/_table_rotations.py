@@ -258,7 +258,7 @@ class _Alike(NamedTuple):
 
 
 def _turns_alike(
-    gyro: _GyroTurns, q_wxyz: Float64[np.ndarray, "n 4"], at_s: Float64[np.ndarray, " n"], span_s: float = SPAN_S
+    gyro: _GyroTurns, q_wxyz: Float64[np.ndarray, "n 4"], at_s: Float64[np.ndarray, " n"], span_s: float
 ) -> _Alike:
     """How far the poses turn as the gyro does; a correlation of zero where they share too little time."""
     if not len(gyro.t_s):

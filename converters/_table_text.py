@@ -161,7 +161,7 @@ def is_text_table(head: bytes, least: int = LEAST_NUMBERS) -> bool:
     return any(_is_row(row, delimiter, least) for row in rows[:LOOKED_AT])
 
 
-def _delimiter(rows: list[str], least: int = LEAST_NUMBERS) -> str | None:
+def _delimiter(rows: list[str], least: int) -> str | None:
     """What separates most rows into equally many fields of which `least` are numbers; None for white space.
 
     Where each row may be one number with a decimal comma, a header of as many names shows two.

@@ -115,7 +115,7 @@ def write_tum(parts: Iterable[Poses], path: Path, overwrite: bool = False) -> No
             target.write(text.encode("ascii"))
 
 
-def write_trajectory(parts: Iterable[Poses], folder: Path, log: str, name: str, overwrite: bool = False) -> None:
+def write_trajectory(parts: Iterable[Poses], folder: Path, log: str, name: str, overwrite: bool) -> None:
     """Write FOLDER/LOG_NAME.tum, as `write_tum`, and the folder."""
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -280,14 +280,14 @@ class Recording:
         return cut
 
 
-def unit_quaternions(q_wxyz: Float64[np.ndarray, "n 4"], tolerance: float = 1e-2) -> Float64[np.ndarray, "n 4"]:
+def unit_quaternions(q_wxyz: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
     """Unit quaternions; rows that already are unit (to 1e-9) keep every bit.
 
     Raises:
-        DataError: a norm differs from one by more than `tolerance`; the message names the row.
+        DataError: a norm differs from one by more than 0.01; the message names the row.
     """
     norm = np.linalg.norm(q_wxyz, axis=1)
-    bad = ~(np.abs(norm - 1.0) <= tolerance)
+    bad = ~(np.abs(norm - 1.0) <= 0.01)
     if bad.any():
         row = int(np.argmax(bad))
         raise DataError(f"quaternion {q_wxyz[row].tolist()} in row {row} has norm {norm[row]:.6g}", expected="norm 1")

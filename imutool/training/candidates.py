@@ -95,7 +95,7 @@ def left_out_model(
     statistics: BiasNetwork,
     effects: Mapping[Sensor, Sequence[str]],
     index: int,
-    scale: Scale | None = None,
+    scale: Scale | None,
 ) -> BiasModel:
     """Model of a candidate's effects, with its prior of the rest bias, from all logs but one.
 

@@ -80,11 +80,11 @@ class RelativeErrors:
 
 
 def pairs_by_distance(
-    travelled: Float64[np.ndarray, " n"], i: Int64[np.ndarray, " _"], distance_m: float, tolerance: float = PAIR_TOLERANCE
+    travelled: Float64[np.ndarray, " n"], i: Int64[np.ndarray, " _"], distance_m: float
 ) -> tuple[Indices, Indices]:
     """Pairs (i, j): the later point j at `distance_m` from point i along the path.
 
-    `travelled` is the length of the path (m) to each point. The distance may differ by a tolerance.
+    `travelled` is the length of the path (m) to each point. The distance may differ by `PAIR_TOLERANCE` of it.
 
     The rule of evo's `--all_pairs`: of equally near points the first. Bisection applies because distance along a path only
     grows (evo searches every pair, minutes for 30 000 poses).
@@ -95,5 +95,5 @@ def pairs_by_distance(
     below = np.clip(below, i + 1, above)
     miss_above = np.abs(travelled[above] - travelled[i] - distance_m)
     miss_below = np.abs(travelled[below] - travelled[i] - distance_m)
-    near = np.minimum(miss_below, miss_above) <= distance_m * tolerance
+    near = np.minimum(miss_below, miss_above) <= distance_m * PAIR_TOLERANCE
     return i[near], np.where(miss_below <= miss_above, below, above)[near]

@@ -26,7 +26,7 @@ LINES = {
 HEIGHT_INCH = 3.8
 
 
-def write_png(identified: IdentifiedNoise, path: Path, *, overwrite: bool = False) -> None:
+def write_png(identified: IdentifiedNoise, path: Path, *, overwrite: bool) -> None:
     """Write a PNG of the Allan deviation of each axis, the fitted sum and each noise term.
 
     Above from rest, below from the residual in motion, where the log has them.

@@ -182,7 +182,7 @@ def _handler(server: Server) -> type[http.server.BaseHTTPRequestHandler]:
     return Handler
 
 
-def check_folder(folder: Path, *, overwrite: bool = False) -> None:
+def check_folder(folder: Path, *, overwrite: bool) -> None:
     """Check before the work that the folder can be written.
 
     Raises:

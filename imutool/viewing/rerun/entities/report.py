@@ -15,7 +15,7 @@ from imutool.viewing.rerun.sdk import Scope
 MAX_EVENTS = 40  # in the list; the Events tab shows all
 
 
-def log_report(data: RunData, to: rr.RecordingStream, scope: Scope, more: Sequence[str] = ()) -> None:
+def log_report(data: RunData, to: rr.RecordingStream, scope: Scope, more: Sequence[str]) -> None:
     """Log the text of `markdown` as `report`."""
     text = rr.TextDocument(markdown(data, more), media_type="text/markdown")
     to.log(sdk.entity_path(scope, "report"), text, static=True, strict=True)

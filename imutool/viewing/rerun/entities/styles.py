@@ -48,7 +48,7 @@ def color_name(data: RunData, trace: Trace) -> str:
     return "orange" if trace.is_raw else COLOR_NAMES[data.models().index(trace) % len(COLOR_NAMES)]
 
 
-def axis_colors(rank: int = 0) -> list[Color]:
+def axis_colors(rank: int) -> list[Color]:
     """Red, green and blue; greyer for each further model."""
     return [blend_to_grey(color, min(NEXT_MODEL_FADE * rank, 0.75)) for color in XYZ]
 
