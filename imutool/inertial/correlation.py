@@ -1,4 +1,4 @@
-"""Cross-correlation of two signals at every lag, how far chance would take it, and whether what is left is white."""
+"""Cross-correlation of signals at every lag, its chance, and whiteness of a residual."""
 
 from __future__ import annotations
 
