@@ -45,7 +45,7 @@ SAME = 100.0  # samples whose poses have the same error
 PARTS, CONTRADICTED = 3, 22.5  # of a start; chi-square of their scatter on three axes, exceeded once in a thousand usual starts
 LEAST_TRUTH_STD = np.array([5e-5] * 3 + [2e-3] * 3)  # rad/s and m/s²: no poses show a bias better
 ITERATIONS = 4
-MOST_TURN_RAD = 1.0  # by a bias: a turn is known up to pi, so that of a larger bias begins near the median of its steps
+MOST_TURN_RAD = 2.0  # by a bias: a turn is known up to pi, so that of a larger bias begins near the median of its steps
 HUBER_MEDIANS = 1.5  # threshold of an outlier, in medians of the residuals
 
 Rows = Float64[np.ndarray, "n 3"]
