@@ -45,6 +45,7 @@ SAME = 100.0  # samples whose poses have the same error
 PARTS, CONTRADICTED = 3, 22.5  # of a start; chi-square of their scatter on three axes, exceeded once in a thousand usual starts
 LEAST_TRUTH_STD = np.array([5e-5] * 3 + [2e-3] * 3)  # rad/s and m/s²: no poses show a bias better
 ITERATIONS = 4
+MOST_TURN_RAD = 2.0  # by a bias: a turn is known up to pi, so that of a larger bias begins near the median of its steps
 HUBER_MEDIANS = 1.5  # threshold of an outlier, in medians of the residuals
 
 Rows = Float64[np.ndarray, "n 3"]
@@ -188,6 +189,11 @@ def bias_from_truth(
     rate, force, offset = samples[:, :3], samples[:, 3:], np.zeros(6)
     turned = quaternion.multiply(quaternion.inverse(q_wb_wxyz[:1]), q_wb_wxyz[1:])
     steps = quaternion.multiply(quaternion.inverse(q_wb_wxyz[:-1]), q_wb_wxyz[1:])
+    known = trusted[:-1] & trusted[1:]
+    of_poses = quaternion.log(steps[known]) / dt[known]
+    coarse = np.median(_step_means(rate)[known] - of_poses, axis=0) if known.any() else np.zeros(3)
+    if float(np.linalg.norm(coarse)) * float(t_s[-1] - t_s[0]) > MOST_TURN_RAD:
+        offset[:3] = coarse
     for _ in range(ITERATIONS):
         running = _integrated(rate - offset[:3], dt)
         if alone is not None and alone.any():

@@ -89,7 +89,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     if len(samples[0]) < 2:
         return Fitness("doubtful", ("the log is too short to be judged",))
     prior = _prior(model)
-    unknown = replace(prior, mean=np.zeros(6), std=UNKNOWN_STD, least=None)
+    unknown = replace(prior, mean=np.where(np.abs(prior.mean) > UNKNOWN_STD, prior.mean, 0.0), std=UNKNOWN_STD, least=None)
     corrected = _without_motion(model, samples, prior)
     found, none, unstarted = _evidence((corrected, samples, corrected), (prior, unknown, unknown))
     shown_std = np.sqrt(DEPENDENT**2 * found.variance + AT_REST_STD**2)

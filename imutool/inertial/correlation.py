@@ -1,11 +1,11 @@
-"""Cross-correlation of two signals at every lag, and how far chance would take it."""
+"""Cross-correlation of signals at every lag, its chance, and whiteness of a residual."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import correlate, correlation_lags
+from scipy.signal import correlate, correlation_lags, periodogram
 
 from imutool.array_types import Bool, Float64, Int64
 
@@ -73,3 +73,24 @@ def time_ahead_s(x: Float64[np.ndarray, "n ..."], y: Float64[np.ndarray, "n ..."
     """Time (s) by which columns y come before columns x that are alike."""
     slope = np.gradient(x, t_s, axis=0) / y.std(axis=0)
     return float(((y - x) / y.std(axis=0) * slope).sum() / max(float((slope**2).sum()), 1e-300))
+
+
+def is_white(
+    residual: Float64[np.ndarray, "n k"],
+    noise: Float64[np.ndarray, " k"],
+    least: Float64[np.ndarray, " k"],
+    bands: int,
+    factor: float,
+    chance: float,
+) -> bool:
+    """Whether a residual is white, has no line, and is only noise at low frequencies.
+
+    It is white if no band is louder than `factor` times the quietest of `bands` bands. A misfit of a motion is loud at low
+    frequencies, or near Nyquist, where poses lose impacts. Less than `least` is no misfit.
+    """
+    f, power = periodogram(residual, fs=2.0, axis=0)  # white noise has its variance at each frequency
+    parts, least = np.stack([part.mean(axis=0) for part in np.array_split(power[1:], bands)]), least**2
+    fast = power[f > 1.0 / bands]
+    line = len(fast) * np.exp(-fast.max(axis=0) / np.maximum(fast.mean(axis=0), least))
+    alike = (parts < factor**2 * np.maximum(parts.min(axis=0), least)).all()
+    return bool(alike and (parts[0] < factor**2 * np.maximum(noise**2, least)).all() and line.min() > chance)

@@ -8,7 +8,7 @@ neighbouring samples), within absolute caps for every log.
 Chosen on the 23 recordings of EuRoC, TUM-VI and FETCH against their true poses: the scatter of 0.1 s means over 1 s is
 at most 0.007 rad/s on the ground with motors running, and at least 0.008 in hovering flight, 0.03 in the hand. Nor does the
 rate of a stop have a trend: a log that never rests has calmest windows, too.
-A steady turn about the vertical looks like a bias; only its difference from the other rest of the log shows it.
+A steady turn about the vertical looks like a bias; only its size, or its difference from the other rest of the log, shows it.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ GAP_PERIODS = 3.0  # a longer step between samples breaks a window
 AT_ONCE = 1 << 14  # windows
 
 Batch = tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]  # stamps in ns, gyro, accel
+Means = Float64[np.ndarray, "*w 3"]
 Positive = Annotated[float, Meta(gt=0)]
 
 
@@ -58,7 +59,8 @@ class StationarySettings(Settings, frozen=True, kw_only=True):
     accel_scatter_m_s2: Positive = 0.12
     gyro_noise_rad_s: Positive = 0.1  # within blocks; EuRoC's idling motors reach 0.085
     accel_noise_m_s2: Positive = 1.5
-    gyro_mean_rad_s: Positive = 0.2  # a larger mean is a turn, not a bias (11 degrees a second)
+    gyro_mean_rad_s: Positive = 0.2  # about gravity; a larger mean is a turn, not a bias (11 degrees a second)
+    gyro_bias_rad_s: Positive = 0.7  # about any axis; ITG-3200 40 degrees a second
     gyro_agreement_rad_s: Positive = 0.02  # between a window's mean and the rate at rest
     gyro_trend_rad_s: Positive = 2e-3  # between the means of a window's halves, beside four deviations of their noise
 
@@ -113,7 +115,7 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
     """Rest stretches of at least `min_s` as ordered, disjoint ranges `[first, end)` of blocks.
 
     Window statistics: block means m_j and variances s_j^2 over k samples each; rest when
-    std(m) <= max(1.3 sqrt(mean(s^2) / k), 2.5 floor) for the gyro, and all four figures are within their caps. The margin of
+    std(m) <= max(1.3 sqrt(mean(s^2) / k), 2.5 floor) for the gyro, and all figures are within their caps. The margin of
     1.3 is that of equally noisy axes (`_white_margin`).
     """
     settings = settings or StationarySettings()
@@ -122,7 +124,7 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
     if count < width:
         return []
     gyro_scatter, gyro_variances, gyro_mean = _window_statistics(blocks.mean[:, :3], blocks.var[:, :3], width)
-    accel_scatter, accel_variances, _ = _window_statistics(blocks.mean[:, 3:], blocks.var[:, 3:], width)
+    accel_scatter, accel_variances, accel_mean = _window_statistics(blocks.mean[:, 3:], blocks.var[:, 3:], width)
     gyro_noise, accel_noise = noise = np.sqrt([variances.sum(axis=1) for variances in (gyro_variances, accel_variances)])
     half = width // 2
     halves = np.lib.stride_tricks.sliding_window_view(blocks.mean[:, :3], half, axis=0).mean(axis=-1)
@@ -136,7 +138,7 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
         & (accel_scatter <= settings.accel_scatter_m_s2)
         & (gyro_noise <= settings.gyro_noise_rad_s)
         & (accel_noise <= settings.accel_noise_m_s2)
-        & (np.linalg.norm(gyro_mean, axis=1) <= settings.gyro_mean_rad_s)
+        & _may_be_bias(gyro_mean, accel_mean, settings)
         & ~np.lib.stride_tricks.sliding_window_view(blocks.late, width).any(axis=-1)
     )
     if rests.any():  # a turn-on bias does not jump: an outlier among the resting windows is a steady turn
@@ -196,18 +198,24 @@ class OnlineRestDetector:
         self._windows += 1
         if scatter[0] > s.gyro_scatter_rad_s or scatter[1] > s.accel_scatter_m_s2:  # nearly always in motion
             return False
-        if noise[0] > s.gyro_noise_rad_s or noise[1] > s.accel_noise_m_s2:
+        if noise[0] > s.gyro_noise_rad_s or noise[1] > s.accel_noise_m_s2 or not _may_be_bias(centre, whole[3:], s):
             return False
         floor = self._calmest[min(FLOOR_RANK, self._windows // 10, len(self._calmest) - 1)]
         white = float(_white_margin(var[:, :3].sum(axis=0))) * noise[0] / math.sqrt(k)
         half = len(mean) // 2
         trend = float(np.linalg.norm(mean[-half:, :3].sum(axis=0) - mean[:half, :3].sum(axis=0))) / half
         steady = trend <= s.gyro_trend_rad_s + TREND_DEVIATIONS * noise[0] * math.sqrt(2.0 / (half * k))
-        if not (scatter[0] <= max(white, FLOOR_MARGIN * floor) and steady and np.linalg.norm(centre) <= s.gyro_mean_rad_s):
+        if not (scatter[0] <= max(white, FLOOR_MARGIN * floor) and steady):
             return False
         self._means.append(np.array([*centre, *noise]))
         kept = np.array(self._means)
         return bool(np.linalg.norm(centre - _rate_at_rest(kept[:, :3], kept[:, 3:].T)) <= s.gyro_agreement_rad_s)
+
+
+def _may_be_bias(rate: Means, force: Means, s: StationarySettings) -> Bool[np.ndarray, "*w"]:
+    """Whether a constant rate may be a bias: a turn about gravity leaves the force as it is, one aside moves it."""
+    aside = np.abs((rate * force).sum(axis=-1)) <= s.gyro_mean_rad_s * np.linalg.norm(force, axis=-1)
+    return np.asarray(aside & (np.linalg.norm(rate, axis=-1) <= s.gyro_bias_rad_s))
 
 
 def _rate_at_rest(means: Float64[np.ndarray, "n 3"], noise: Float64[np.ndarray, "2 n"]) -> Float64[np.ndarray, "3"]:
@@ -251,29 +259,6 @@ def may_rest(imu: Imu) -> bool:
     samples, count = np.concatenate([imu.gyro, imu.accel], axis=1), min(len(imu), round(0.5 / imu.period_s) + 1)
     means = samples[: len(samples) // count * count].reshape(-1, count, 6).mean(axis=1)
     return bool((np.abs(means - np.median(means, axis=0)) < MOST_DRIFT).all())
-
-
-def is_white(
-    residual: Float64[np.ndarray, "n k"],
-    noise: Float64[np.ndarray, " k"],
-    least: Float64[np.ndarray, " k"],
-    bands: int,
-    factor: float,
-    chance: float,
-) -> bool:
-    """Whether a residual is white, has no line, and is only noise at low frequencies.
-
-    It is white if no band is louder than `factor` times the quietest of `bands` bands. A misfit of a motion is loud at low
-    frequencies, or near Nyquist, where poses lose impacts. Less than `least` is no misfit.
-    """
-    from scipy.signal import periodogram
-
-    f, power = periodogram(residual, fs=2.0, axis=0)  # white noise has its variance at each frequency
-    parts, least = np.stack([part.mean(axis=0) for part in np.array_split(power[1:], bands)]), least**2
-    fast = power[f > 1.0 / bands]
-    line = len(fast) * np.exp(-fast.max(axis=0) / np.maximum(fast.mean(axis=0), least))
-    alike = (parts < factor**2 * np.maximum(parts.min(axis=0), least)).all()
-    return bool(alike and (parts[0] < factor**2 * np.maximum(noise**2, least)).all() and line.min() > chance)
 
 
 def _white_margin(variances: Float64[np.ndarray, "*w 3"]) -> Float64[np.ndarray, "*w"]:

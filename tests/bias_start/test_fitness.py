@@ -110,6 +110,14 @@ def test_gravity_confirms_the_sensors_own_correction(model: BiasModel, scaled: I
     assert "% of the model's correction" in found.reasons[0]
 
 
+def test_another_units_correction_is_caught_beside_a_bias_larger_than_usual(model: BiasModel, scaled: Imu) -> None:
+    bias, other = np.array([0.4, -0.3, 0.35]), corrects(model, -WRONG.T)
+    rest = model.prior_mean + np.concatenate([np.linalg.inv(np.eye(3) - WRONG.T) @ bias, np.zeros(3)])
+    made = linear.Model(linear.Config(), model.rate_hz, dict(other.tensors) | {"prior_mean": rest})
+    made.card = model.card
+    assert judged(made, replace(scaled, gyro=scaled.gyro + bias)).verdict == "unfit"
+
+
 @pytest.mark.parametrize("half_turns", [True, False])
 def test_turned_axes_are_caught_though_a_scale_is_the_same_in_them(
     model: BiasModel, recording: Recording, half_turns: bool

@@ -216,6 +216,12 @@ def test_twelve_seconds_of_truth_show_the_bias(biased: Recording) -> None:
     assert start.how == "truth over 12.0 s, ±1e-06 rad/s (0.0043° a minute)"
 
 
+def test_a_bias_that_turns_by_more_than_half_a_turn_is_found_by_the_truth(biased: Recording) -> None:
+    large = np.array([0.0, 0.6, 0.2])  # it was found off by (-0.07, -1.27, -0.56)
+    start = from_truth(sees_everything(), replace(biased, imu=replace(biased.imu, gyro=biased.imu.gyro + large)))
+    assert (np.abs(start.rest[:3] - GYRO_BIAS - large) < TRUTH[:3]).all()
+
+
 @pytest.mark.parametrize("late_s", [0.02, -0.025])
 def test_poses_that_are_late_give_the_start_of_poses_that_are_not(late_s: float) -> None:
     """30 ms cost 7e-4 rad/s on V1_02, three of the deviations that were stated."""

@@ -122,6 +122,15 @@ def test_a_steady_turn_too_fast_for_a_bias_is_not_rest():
     assert rest_stretches(Imu(t_ns, gyro + np.array([0.0, 0.0, 0.5]), accel)) == []
 
 
+@pytest.mark.parametrize(("bias", "rests"), [((0.3, -0.25, 0.0), True), ((0.0, 0.0, 0.3), False), ((0.9, 0.0, 0.0), False)])
+def test_a_large_rate_that_leaves_gravity_aside_of_it_in_place_is_a_bias(bias: tuple[float, ...], rests: bool) -> None:
+    t_ns, gyro, accel = made(4.0)
+    gyro = gyro + np.array(bias)
+    detector, half = OnlineRestDetector(), int(0.5 * RATE_HZ)
+    live = [detector(gyro[k : k + half], accel[k : k + half]) for k in range(0, len(t_ns), half)]
+    assert (bool(rest_stretches(Imu(t_ns, gyro, accel))), live[-1]) == (rests, rests)
+
+
 def test_the_calmest_seconds_of_a_log_that_never_rests_are_no_rest():
     """A slow turn to and fro, whose rate changes by 0.015 rad/s in a second."""
     t_ns, gyro, accel = made(60.0)

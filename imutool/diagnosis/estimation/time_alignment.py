@@ -20,10 +20,10 @@ from imutool.diagnosis.estimation.timestamps import without_jitter
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError
 from imutool.geometry import quaternion
-from imutool.inertial.correlation import cross_correlation
+from imutool.inertial.correlation import cross_correlation, is_white
 from imutool.inertial.kinematics import G_W, attitude_by_gyro, fit_trajectory, gravity_error
 from imutool.inertial.resampling import refined, refinement
-from imutool.inertial.stationary import is_white, may_rest, nothing_but_noise, white_noise
+from imutool.inertial.stationary import may_rest, nothing_but_noise, white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.inertial.wiener import NoiseLeft, denoised, recorded_at
 from imutool.recording import Imu, Recording, Times, nanoseconds, seconds
