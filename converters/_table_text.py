@@ -126,7 +126,7 @@ class Columns:
 
 
 def text_of(raw: bytes) -> str:
-    """Text in UTF-8 or UTF-16, else in the code page of Western Windows; its lines end as on Unix, also old Macintosh's."""
+    """Text in UTF-8 or UTF-16, else in the code page of Western Windows, with lines as on Unix."""
     return _with_arrivals(_decoded(raw).replace("\r\n", "\n").replace("\r", "\n"))
 
 
