@@ -917,3 +917,10 @@ def test_lines_that_end_as_on_an_old_macintosh_are_lines(tmp_path):
     path = write_csv(tmp_path / "imu.csv", NAMES, [T_S, *(9.80665 * ACCEL_G).T, *(COUNTS / 131.0).T])
     path.write_bytes(path.read_bytes().replace(b"\n", b"\r"))
     assert len(read(path).imus["/imu0"]) == COUNT
+
+
+def test_a_structure_of_matlab_for_each_sample_is_a_table(tmp_path):
+    columns = [T_S, *(9.80665 * ACCEL_G).T, *(COUNTS / 131.0).T]
+    samples = np.array([*zip(*columns, strict=True)], [(name, object) for name in NAMES])
+    scipy.io.savemat(tmp_path / "imu.mat", {"IMU_data": samples})
+    np.testing.assert_allclose(read(tmp_path / "imu.mat").imus["/imu0"].accel, 9.80665 * ACCEL_G)
