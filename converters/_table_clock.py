@@ -31,7 +31,7 @@ from ._table_units import TIME_NS
 
 MOST_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
 SENSOR_TIME = r"(sensor|event|hardware|hw)_?(event_?)?(time|t_|ts|stamp)"  # Android's, beside the time of the program
-OWN_TIME = {"gyro": r"gyro(scope)?_t", "accel": r"accel(erometer)?_t"}  # names of a sensor's own stamps begin so
+OWN_TIME = {"gyro": r"gyro?(scope)?_t", "accel": r"acc(el(eration|erometer)?)?_t"}  # names of a sensor's own stamps begin so
 
 
 def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns: Columns, given: Entries) -> None:

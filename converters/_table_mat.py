@@ -112,6 +112,10 @@ def _flat(content: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any,
         if name.startswith("__"):
             continue
         cells = value if isinstance(value, list) else _cells(value)
+        if len(cells) > 1 and all(isinstance(cell, dict) and all(map(np.isscalar, cell.values())) for cell in cells):
+            samples = {key: np.array([cell[key] for cell in cells]) for key in cells[0]}  # `IMU(k).Time` of each sample
+            yield from _flat(samples, f"{prefix}{name}.")
+            continue
         for number, cell in enumerate(cells, 1):
             if isinstance(cell, dict):
                 yield from _flat(cell, f"{prefix}{name}.{number}.")

@@ -903,3 +903,24 @@ def test_of_a_shimmers_two_accelerometers_the_low_noise_one_is_taken(tmp_path):
     log = read(path)
     np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL_G * 9.80665)
     assert any("is the low-noise accelerometer of two" in note for note in log.remarks.notes)
+
+
+@pytest.mark.parametrize(("accel_time", "gyro_time"), [("acc_time", "gyro_time"), ("Acc_ts", "Gyr_ts")])
+def test_each_sensor_keeps_its_own_time_also_where_its_name_is_short(accel_time, gyro_time, tmp_path):
+    names = [accel_time, "ax", "ay", "az", gyro_time, *(f"gyro_{axis} (rad/s)" for axis in "xyz")]
+    ramp = np.stack([T_S, 0.0 * T_S, 0.0 * T_S + 9.81])  # at each time of the accelerometer
+    imu = read(write_csv(tmp_path / "imu.csv", names, [T_S, *ramp, T_S + 0.504, *(0.01 * COUNTS).T])).imus["/imu0"]
+    np.testing.assert_allclose(imu.accel[:, 0], imu.t_ns * 1e-9, atol=1e-6)
+
+
+def test_lines_that_end_as_on_an_old_macintosh_are_lines(tmp_path):
+    path = write_csv(tmp_path / "imu.csv", NAMES, [T_S, *(9.80665 * ACCEL_G).T, *(COUNTS / 131.0).T])
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r"))
+    assert len(read(path).imus["/imu0"]) == COUNT
+
+
+def test_a_structure_of_matlab_for_each_sample_is_a_table(tmp_path):
+    columns = [T_S, *(9.80665 * ACCEL_G).T, *(COUNTS / 131.0).T]
+    samples = np.array([*zip(*columns, strict=True)], [(name, object) for name in NAMES])
+    scipy.io.savemat(tmp_path / "imu.mat", {"IMU_data": samples})
+    np.testing.assert_allclose(read(tmp_path / "imu.mat").imus["/imu0"].accel, 9.80665 * ACCEL_G)
