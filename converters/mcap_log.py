@@ -35,10 +35,10 @@ IMAGES = r"(sensor_msgs/(msg/)?|foxglove\.)(CompressedImage|Image|RawImage)"
 def sequences(source: Path) -> list[Sequence]:
     """The source itself, if it is an MCAP log; logs in folders that imutool did not write."""
     if source.is_dir():
-        parts = find_folders(source, lambda folder: bool(_parts(folder)))
-        taken = [sequence.path for sequence in parts]
+        split = find_folders(source, lambda folder: bool(parts(Sequence(folder.name, folder))))
+        taken = [sequence.path for sequence in split]
         alone = (log for log in _logs(source) if log.path.parent not in taken and not _is_of_bag(log.path.parent))
-        return parts + [log for log in alone if not _is_ours(log.path)]
+        return split + [log for log in alone if not _is_ours(log.path)]
     return [Sequence(name(source), source)] if source.is_file() and head(source, len(MAGIC)) == MAGIC else []
 
 
@@ -70,7 +70,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, define: Define = a
         DataError: the log is damaged.
     """
     if sequence.path.is_dir():
-        paths = _parts(sequence.path)
+        paths = parts(sequence)
         note = f"the bag has no {METADATA}; read in this order: {', '.join(path.name for path in paths)}"
         return read_parts(sequence, paths, Remarks([note]), images=images, define=define)
     with _refusing(sequence.path), sequence.path.open("rb") as file:
@@ -123,22 +123,23 @@ def _refusing(path: Path) -> Iterator[None]:
         raise DataError(f"cannot be read as an MCAP log ({reason})", where=path, fix=fix) from error
 
 
-def _parts(folder: Path) -> list[Path]:
-    """Parts of a ROS 2 bag without metadata.yaml, in order; none where the logs in a folder are not those of one recording.
+def parts(sequence: Sequence) -> list[Path]:
+    """Parts of a ROS 2 bag without metadata.yaml, in order; none of other folders.
 
     A recorder numbers its parts from 0, and each begins where the one before it ends.
     """
+    folder = sequence.path
     if _is_of_bag(folder):
         return []
     files = [path for path in with_suffix(folder, ".mcap") if path.is_file() and path.stat().st_size]
     named = {int(match[2]): (match[1], path) for path in files if (match := re.fullmatch(PART, path.stem))}
-    parts = [named[number][1] for number in sorted(named)]
+    found = [named[number][1] for number in sorted(named)]
     one_name = len(files) == len(named) and len({stem for stem, _ in named.values()}) == 1
-    if not one_name or sorted(named) != [*range(len(named))] or any(head(p, len(MAGIC)) != MAGIC for p in parts):
+    if not one_name or sorted(named) != [*range(len(named))] or any(head(p, len(MAGIC)) != MAGIC for p in found):
         return []
-    spans = map(_span, parts) if len(parts) > 1 else ()
+    spans = map(_span, found) if len(found) > 1 else ()
     gaps = (after[0] - before[1] for before, after in pairwise(spans) if before and after)
-    return parts if all(abs(gap) < MOST_PAUSE_NS for gap in gaps) else []
+    return found if all(abs(gap) < MOST_PAUSE_NS for gap in gaps) else []
 
 
 def _is_of_bag(folder: Path) -> bool:

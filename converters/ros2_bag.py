@@ -48,6 +48,13 @@ def recognises(sequence: Sequence) -> bool:
     return True
 
 
+def parts(sequence: Sequence) -> list[Path]:
+    """Storage files of a bag's folder: those that its metadata.yaml names, if all are there."""
+    path = sequence.path
+    named = [path / name for name in _named(path)] if path.is_dir() and _has_metadata(path) else []
+    return named if named and all(file.is_file() for file in named) else with_suffix(path, ".mcap")
+
+
 def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     """Message log of a bag.
 

@@ -18,8 +18,10 @@ from imutool.conversion.corrections import Corrections
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.user_labels import Labels
 from imutool.errors import ConfigError, DataError, ImutoolError
+from imutool.file_location import first_bytes
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.joined_imu import JOIN_VECTORS
+from imutool.mcap_io.codec.records import MAGIC
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.target import writing
@@ -227,22 +229,33 @@ def check_targets(jobs: Sequence[Job], source: Path) -> None:
         if (other := jobs_by_target.setdefault(job.target, job)) is not job:
             what = f"two sequences are named {job.sequence.name}: {other.sequence} and {job.sequence}"
             raise ConfigError(what, where="source", fix="Convert them one at a time")
-        sources = getattr(job.sequence, "path", None), source if source.is_file() else None, *_stated_files(job)
+        sources = getattr(job.sequence, "path", None), source if source.is_file() else None, *_other_files(job)
         if any(path is not None and _is_part_of(job.target, path) for path in sources):
             raise ConfigError("is the source itself", where=job.target, expected="another `out`")
         if job.target.exists() and not job.overwrite:
             raise ConfigError("exists", where=job.target, fix="Choose another `out`, or add `overwrite`")
+        if (
+            job.target.is_file()
+            and job.target.suffix.lower() != SUFFIX
+            and first_bytes(job.target, len(MAGIC)) not in (MAGIC, b"")
+        ):
+            fix = "One command converts one file, or a folder of them"  # a shell makes two words of *.csv
+            raise ConfigError("exists and is no MCAP log", where=job.target, expected="another `out`", fix=fix)
 
 
-def _stated_files(job: Job) -> list[Path]:
-    """Map of a job, and the table of true poses that it names; they are read only where a log may replace them."""
-    if job.mapping is None or not job.target.exists():
+def _other_files(job: Job) -> list[Path]:
+    """Parts of a bag, the map, and the poses that it names; they are read only where a log may replace them."""
+    if not job.target.exists():
         return []
+    module = registry.load(GROUP, job.converter)
+    parts: list[Path] = module.parts(job.sequence) if hasattr(module, "parts") else []
+    if job.mapping is None:
+        return parts
     own = [job.mapping] if isinstance(job.mapping, Path) else []
     entries = toml(job.mapping, "map of a table") if isinstance(job.mapping, Path) else job.mapping
     place = getattr(job.sequence, "path", job.target)
     poses = (place if place.is_dir() else place.parent) / str(entries.get("truth_file", ""))
-    return [path for path in (*own, poses) if path.is_file()]
+    return [path for path in (*parts, *own, poses) if path.is_file()]
 
 
 def _is_part_of(target: Path, source: Path) -> bool:

@@ -56,6 +56,9 @@ TRUTH_FOLDERS = {
     "/ground_truth_vicon/pose": "vicon0",
 }
 IMAGES = {b"\x89PNG\r\n\x1a\n": ".png", b"\xff\xd8\xff": ".jpg"}  # by how the bytes begin
+HOLDS = (  # paths in a folder that is written
+    r"mav0(/(body\.yaml|(imu0|vicon0|state_groundtruth\w*|cam\d+)(/(data\.csv|sensor\.yaml))?|cam\d+/data(/\d+\.(png|jpg))?))?"
+)
 
 
 def write(
@@ -69,7 +72,7 @@ def write(
     given = datasheet.read(sensor_noise) if sensor_noise is not None else None
     with Log(log) as opened:
         topic, topics = imu or _best_imu(opened), list(opened.topics)
-        with FolderTarget(out, log, signed="mav0/imu0/sensor.yaml", holds="mav0", overwrite=overwrite) as folder, writing(out):
+        with FolderTarget(out, log, signed="mav0/imu0/sensor.yaml", holds=HOLDS, overwrite=overwrite) as folder, writing(out):
             root, name = folder / "mav0", opened.topic(topic, (schemas.IMU,)).name
             try:
                 writer = _written(opened, name, root, None, given, tell)

@@ -32,7 +32,7 @@ def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport
         name = f"{out.absolute().name}_0.mcap"
         text = _metadata_yaml(opened, name)
         counts = {topic.name: topic.count for topic in opened.topics.values()}
-    holds = r"metadata\.yaml|.*_\d+\.mcap"
+    holds = rf"metadata\.yaml|{re.escape(name)}"
     with FolderTarget(out, log, signed="metadata.yaml", holds=holds, overwrite=overwrite) as folder, writing(out):
         _copy(log, folder / name, tell)
         if identity(log) != before:  # the index and the bytes are of two logs

@@ -234,6 +234,29 @@ def test_a_source_is_never_the_target(tmp_path):
     assert content(tmp_path) == before
 
 
+@pytest.mark.parametrize("metadata", [True, False])
+def test_no_part_of_a_bag_is_the_target(tmp_path, metadata):
+    imutool_api.write(tmp_path / "log.mcap", imutool_api.example_recording(duration_s=4.0))
+    imutool_api.export(tmp_path / "log.mcap", bag := tmp_path / "bag", format="rosbag2")
+    if not metadata:
+        (bag / "metadata.yaml").unlink()
+    (bag / "bag_0.mcap").rename(part := bag / "bag.mcap" if metadata else bag / "bag_0.mcap")
+    if metadata:
+        (bag / "metadata.yaml").write_text((bag / "metadata.yaml").read_text().replace("bag_0.mcap", "bag.mcap"))
+    before = content(tmp_path)
+    for out in (part, *[bag][: int(metadata)]):
+        with pytest.raises(ConfigError, match="is the source itself"):
+            convert(bag, out, overwrite=True)
+    assert content(tmp_path) == before
+
+
+def test_a_log_takes_the_place_of_a_log_alone(source, tmp_path):
+    (tmp_path / "b.csv").write_text("the second word of *.csv")
+    with pytest.raises(ConfigError, match="is no MCAP log"):
+        convert(source / "a", tmp_path / "b.csv", overwrite=True)
+    assert (tmp_path / "b.csv").read_text() == "the second word of *.csv"
+
+
 @pytest.mark.parametrize("out", ["map.toml", "poses.csv"])
 def test_a_map_and_the_poses_that_it_names_are_never_the_target(tmp_path, out):
     rows = "".join(f"{n * 10**7},0,0,0,0,0,9.81\n" for n in range(400))

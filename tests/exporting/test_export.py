@@ -428,10 +428,13 @@ def test_a_folder_that_was_not_made_here_is_never_removed(log: Path, tmp_path: P
         export(log, original, format=format, overwrite=True)
     assert everything(original) == held
     signed.write_text(made, encoding="utf-8")
-    (original / "thesis.tex").write_text("years of work")
-    with pytest.raises(ConfigError, match=r"thesis\.tex"):
-        export(log, original, format=format, overwrite=True)
-    (original / "thesis.tex").unlink()
+    added = ("mav0/imu0/notes.txt", "mav0/cam7/data.csv") if format == "euroc" else ("walk_1.mcap",)
+    for name in ("thesis.tex", *added):
+        (original / name).parent.mkdir(exist_ok=True)
+        (original / name).write_text("years of work")
+        with pytest.raises(ConfigError, match=rf"holds {Path(name) if '7' not in name else 'mav0/cam7'}, which this export"):
+            export(log, original, format=format, overwrite=True)
+        (original / name).unlink()
     with pytest.raises(ConfigError, match="not a folder"):
         export(log, log, format=format, overwrite=True)
 

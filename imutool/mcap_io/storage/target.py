@@ -185,7 +185,7 @@ class FolderTarget:
     """The folder being written; leaving the context without an error puts it in its place.
 
     Any error, Ctrl-C included, removes what was written. An older folder is replaced only if its file `signed` says that it
-    was made here and its top holds nothing but what `holds` matches: a data set that merely looks alike is never removed.
+    was made here, all paths in it match `holds`, and all its folders are written again: no other file is removed with it.
 
     Raises:
         ConfigError: the target exists (without `overwrite`), is not an export, holds the log, or cannot be written.
@@ -210,10 +210,21 @@ class FolderTarget:
             raise ConfigError("the target is not a folder", where=self.path, expected="the name of a new folder")
         if self.log.resolve().is_relative_to(self.path.resolve()):
             raise ConfigError("the target holds the log itself", where=self.path, expected="another folder")
-        foreign = sorted(entry.name for entry in self.path.iterdir() if not re.fullmatch(self.holds, entry.name))
+        within = sorted(entry.relative_to(self.path) for entry in self.path.rglob("*"))
+        foreign = [str(entry) for entry in within if not (re.fullmatch(self.holds, entry.as_posix()) and self._makes(entry))]
         if foreign or not self._was_made_here():
-            what = f"the target holds {foreign[0]}, which no export makes" if foreign else "the target was not made by imutool"
+            what = (
+                f"the target holds {foreign[0]}, which this export does not make"
+                if foreign
+                else "the target was not made by imutool"
+            )
             raise ConfigError(what, where=self.path, fix="Choose another folder, or remove this one yourself")
+
+    def _makes(self, entry: Path) -> bool:
+        """Whether an entry is a file, or a folder that is written again, as far as that is known yet."""
+        if not hasattr(self, "temporary") or not (self.path / entry).is_dir():
+            return True
+        return (self.temporary / entry).is_dir() and not (self.path / entry).is_symlink()
 
     def _was_made_here(self) -> bool:
         return SIGNATURE.encode() in first_bytes(self.path / self.signed, len(SIGNATURE) + 80)
