@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from imutool.recording import nanoseconds
 BLOCK = 4096  # samples: what rules see at a time depends on the log alone, not on how its chunks were cut
 STEP_NS = nanoseconds(0.1)
 STEP_S = 0.1  # of `Motion`
+MOST_FRAMES = 4  # that a warning names
 MOST_RATES = 20_000  # samples of the gyro that are kept as they are: 480 kB
 
 Numbers = Int64[np.ndarray, " n"]
@@ -35,6 +37,22 @@ class Samples(NamedTuple):
 def joined(parts: list[Samples]) -> Samples:
     """Concatenated samples."""
     return parts[0] if len(parts) == 1 else Samples(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def counted_frames(batches: Iterable[ImuBatch], frames: Counter[str]) -> Iterator[ImuBatch]:
+    """The batches; their messages are counted by frame as they come."""
+    for batch in batches:
+        frames[batch.frame_id.lstrip("/")] += len(batch.stamp_ns)
+        yield batch
+
+
+def frame_words(frames: Mapping[str, int]) -> list[str]:
+    """Warning about an IMU whose messages name several frames; none for one frame."""
+    if len(frames) < 2:
+        return []
+    named = [f"{frame or 'none'} ({count})" for frame, count in [*frames.items()][:MOST_FRAMES]]
+    more = ", …" if len(frames) > MOST_FRAMES else ""
+    return [f"the messages name {len(frames)} frames: {', '.join(named)}{more}; several sensors have no common bias"]
 
 
 def blocks(batches: Iterable[ImuBatch]) -> Iterator[Samples]:

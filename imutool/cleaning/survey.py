@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -16,7 +17,7 @@ from imutool.cleaning.finding import Finding, FindingReport, Verdict, score, ver
 from imutool.cleaning.likelihood import axis_names
 from imutool.cleaning.rule import GROUP, CleaningSettings, Rule, TopicSummary
 from imutool.cleaning.rules.gaps import MISSING
-from imutool.cleaning.samples import Motion, Samples, blocks
+from imutool.cleaning.samples import Motion, Samples, blocks, counted_frames, frame_words
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
@@ -208,11 +209,13 @@ def examine(
     """
     settings = settings or CleaningSettings()
     names = settings.names()
-    stages, whole = _through(each(), truth, settings, {name: _rule(name)() for name in names})
+    frames = Counter[str]()
+    stages, whole = _through(counted_frames(each(), frames), truth, settings, {name: _rule(name)() for name in names})
     second = {name: stage.second_pass(whole.messages) for name, stage in stages.items()}
     if any(stage is not None for stage in second.values()):
         stages, whole = _through(each(), truth, settings, {name: second[name] or _rule(name)() for name in names})
-    findings = tuple(finding for stage in stages.values() for finding in stage.findings(whole))
+    found = [finding for stage in stages.values() for finding in stage.findings(whole)]
+    findings = (*found, *(Finding("frames", "warning", what, len(frames)) for what in frame_words(frames)))
     dropped = np.zeros(whole.messages, bool)
     for stage in stages.values():
         for numbers in stage.dropped:

@@ -17,7 +17,7 @@ from imutool.cleaning import raw_batches
 from imutool.cleaning.rules.gaps import missing
 from imutool.cleaning.rules.not_finite import measured
 from imutool.cleaning.rules.saturation import AxisLimits
-from imutool.cleaning.samples import Samples, blocks, joined
+from imutool.cleaning.samples import Samples, blocks, counted_frames, joined
 from imutool.cleaning.stamp_line import Stamps, distinct, read_stamps, restamped, usual_period
 from imutool.log_info.clock import IncreasingStamps, SensorStamps, sorted_stamps
 from imutool.log_info.report import Interval
@@ -39,6 +39,7 @@ class ImuSamples:
         counts: messages with a defect by its name; `missing` and `saturated` are complete after `counted`.
         recorded: messages, and their stamps, in order of time.
         sound: stamps of the samples.
+        frames: messages by the frame that they name.
         stamps, jumps: faults of the stamps, and jumps of their clock.
     """
 
@@ -52,9 +53,10 @@ class ImuSamples:
         self._limits = AxisLimits(6)
         self._rank: Int64[np.ndarray, " n"] | None = None  # of each message among the samples, -1 of those that are none
         self._lag_ns = np.inf, -np.inf  # of the log times behind the stamps
+        self.frames = Counter[str]()
         recorded, self.sound = SensorStamps(), IncreasingStamps()
         self.stamps, messages, finite = NO_FAULTS, 0, 0
-        for samples in self._read():
+        for samples in blocks(counted_frames(raw_batches(log, topic), self.frames)):
             good = measured(samples.values)
             recorded.see(samples.stamp_ns)
             self.sound.see(samples.stamp_ns[good])

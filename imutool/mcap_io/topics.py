@@ -214,8 +214,7 @@ class StampCheck:
 def topics_of(index: LogIndex) -> dict[str, Topic]:
     """The topics of a log by their names, in order of their channel ids.
 
-    Raises:
-        LogError: two channels of one topic carry different messages.
+    A topic whose channels carry different messages is listed with both types, and nothing reads it.
     """
     found: dict[str, Topic] = {}
     counts = index.counts()
@@ -230,8 +229,8 @@ def topics_of(index: LogIndex) -> dict[str, Topic]:
             MappingProxyType(dict(channel.metadata)),
         )
         if before and (before.schema_name, before.message_encoding) != (topic.schema_name, topic.message_encoding):
-            both = " and ".join(f"{t.schema_name or 'no type'} in {t.message_encoding}" for t in (before, topic))
-            raise LogError(f"{channel.topic} carries {both}", expected="messages of one type")
+            both = " and ".join(t.schema_name or f"no type in {t.message_encoding}" for t in (before, topic))
+            topic = replace(topic, schema_name=both, schema_encoding="", message_encoding="several types")
         found[channel.topic] = topic
     return found
 

@@ -19,9 +19,12 @@ from support.imu_defects import survey
 from imutool.cli.info import imu_rows, topic_rows
 from imutool.conversion.run import convert
 from imutool.converters import fetch, tum_vi
+from imutool.debiasing import debias
 from imutool.errors import LogError
 from imutool.log_info.inspection import inspect
+from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu
+from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import GRAVITY_M_S2, Frames, Imu, Poses, Recording
@@ -430,3 +433,23 @@ def test_messages_that_a_message_index_leaves_out_are_counted(tmp_path: Path, mo
             writer.add_message(text, START_NS + n * PERIOD_NS, b'"text"', START_NS)
         writer.finish()
     assert described(tmp_path / "a.mcap")["messages"] == 200
+
+
+def test_two_sensors_on_one_topic_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Their biases differ, and debias took the mean of both without a word; clean found the log good."""
+    with (path := tmp_path / "two.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        kind = writer.register_schema(schemas.IMU, "ros2msg", schemas.definition(schemas.IMU).encode())
+        channel = writer.register_channel("/imu", "cdr", kind)
+        imu = resting(2000)
+        for n, frame in enumerate(["/front", "rear"] * 1000):
+            rows = slice(n, n + 1)
+            payload = encode_imu(imu.t_ns[rows], imu.gyro[rows], imu.accel[rows], frame)[0].tobytes()
+            writer.add_message(channel, int(imu.t_ns[n]), payload, int(imu.t_ns[n]))
+        writer.finish()
+    said = "the messages name 2 frames: front (1000), rear (1000); several sensors have no common bias"
+    assert json_values(inspect(path))["imu"][0]["warnings"] == [said]
+    assert [(finding.rule, finding.what) for finding in survey(path).findings] == [("frames", said)]
+    debias(path, tmp_path / "out.mcap")
+    assert f"/imu: {said}" in caplog.text

@@ -456,6 +456,22 @@ def test_a_topic_that_is_not_there_or_is_something_else_is_refused(foreign: Fore
         next(log.stamps("/x"))
 
 
+def test_another_topic_of_two_types_leaves_the_imu_readable(tmp_path: Path, make: Make) -> None:
+    with (path := tmp_path / "two.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        kind = {k: writer.register_schema(k, "ros2msg", schemas.definition(k).encode()) for k in (schemas.IMU, schemas.POSE)}
+        imu = writer.register_channel("/imu", "cdr", kind[schemas.IMU])
+        writer.register_channel("/both", "cdr", kind[schemas.POSE])
+        writer.register_channel("/both", "json", 0)
+        for _, _, *times, sequence, payload in imu_messages(make):
+            writer.add_message(imu, times[0], payload, times[1], sequence)
+        writer.finish()
+    assert len(read(path).imu) == 20
+    with pytest.raises(LogError, match="/both carries geometry_msgs/msg/PoseStamped and no type in json; expected"):
+        read(path, truth="/both")
+
+
 def test_an_unknown_encoding_is_named(foreign: Foreign, make: Make) -> None:
     with pytest.raises(LogError, match="/imu is encoded as 'json'; expected cdr or ros1"):
         read(foreign(imu_messages(make), encoding="json"))
