@@ -70,6 +70,12 @@ def _bias_step(w: Words) -> str:
     return f"its bias steps by {w.main}{when}"
 
 
+def _scale(w: Words) -> str:
+    """By how much it is off, and from when on."""
+    when = f" from {w.rest[0]} on" if w.rest else ""
+    return f"its scale is off by {w.main}{when}"
+
+
 def _bias_drift(w: Words) -> str:
     """Size of a warm-up, or rate of a drift whose end the log does not show."""
     return f"its bias drifts by {w.main}{' in all' if w.rest else ', steadily'}"
@@ -156,8 +162,7 @@ def _reference_error(w: Words) -> str:
 SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "gyro_bias": "{w.it} reads a constant {w.main} too much",
     "accel_bias": "{w.it} reads a constant {w.main} too much",
-    "gyro_scale": "its scale is off by {w.main}",
-    "accel_scale": "its scale is off by {w.main}",
+    **dict.fromkeys(("gyro_scale", "accel_scale"), _scale),
     "gyro_scale_asymmetry": "its scale for positive readings exceeds that for negative ones by {w.main}",
     "accel_scale_asymmetry": "its scale for positive readings exceeds that for negative ones by {w.main}",
     "gyro_misalignment": "its axes are not square: one shows on another by {w.main}",
