@@ -30,7 +30,6 @@ from imutool.sensor.signals import Signals
 from imutool.units import AXES, Three
 
 Kind = Literal["catalogue", "driven", "unknown"]
-STEP = "step"  # variant of a scale that sets in at one time, also beside the scale of the whole log
 ONCE_MORE = ("second", "third")  # variants of an effect that acts several times, each beside the one before
 Theta = Float64[np.ndarray, "_"]  # effects that act together have parameters of their own, so this length binds no other
 

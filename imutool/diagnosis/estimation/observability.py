@@ -18,9 +18,10 @@ from imutool.diagnosis.estimation.significance import bic, parameter_cost
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.recording import GRAVITY_M_S2
-from imutool.sensor.effect import ONCE_MORE, STEP, Effect, Theta
+from imutool.sensor.effect import ONCE_MORE, Effect, Theta
 from imutool.sensor.effects import low_pass, vibration
 from imutool.sensor.effects.gyro_hysteresis import play
+from imutool.sensor.effects.gyro_scale import STEP
 
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
 SHARED, STANDS_STILL = "share", 0.4  # variant of a hysteresis; of the motion, what such a share moves at least

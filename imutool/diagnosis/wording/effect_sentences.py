@@ -70,12 +70,6 @@ def _bias_step(w: Words) -> str:
     return f"its bias steps by {w.main}{when}"
 
 
-def _scale(w: Words) -> str:
-    """By how much it is off, and from when on."""
-    when = f" from {w.rest[0]} on" if w.rest else ""
-    return f"its scale is off by {w.main}{when}"
-
-
 def _bias_drift(w: Words) -> str:
     """Size of a warm-up, or rate of a drift whose end the log does not show."""
     return f"its bias drifts by {w.main}{' in all' if w.rest else ', steadily'}"
@@ -162,7 +156,8 @@ def _reference_error(w: Words) -> str:
 SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "gyro_bias": "{w.it} reads a constant {w.main} too much",
     "accel_bias": "{w.it} reads a constant {w.main} too much",
-    **dict.fromkeys(("gyro_scale", "accel_scale"), _scale),
+    "gyro_scale": (scale := lambda w: f"its scale is off by {w.main}{f' from {w.rest[0]} on' if w.rest else ''}"),
+    "accel_scale": scale,
     "gyro_scale_asymmetry": "its scale for positive readings exceeds that for negative ones by {w.main}",
     "accel_scale_asymmetry": "its scale for positive readings exceeds that for negative ones by {w.main}",
     "gyro_misalignment": "its axes are not square: one shows on another by {w.main}",

@@ -63,7 +63,7 @@ def _starts(sensor: int, before: int, motion: IdealMotion, samples: SensorSample
 
 
 def followed(ideal: SensorSamples) -> Float64[np.ndarray, "n q"]:
-    """What most other errors follow: both signals (scale, mount), changes of both (clock), products of rates (an arm)."""
+    """Signals (scale, mount), their changes (clock), products of rates (an arm)."""
     products = np.stack([ideal.gyro[:, i] * ideal.gyro[:, j] for i in range(3) for j in range(i + 1)], axis=1)
     return np.concatenate(
         [ideal.gyro, ideal.accel, ideal.alpha, np.gradient(ideal.accel, ideal.stamp_s, axis=0), products], axis=1
@@ -77,11 +77,12 @@ def likeliest_onset(
     before: int = 0,
     setting_in: Float64[np.ndarray, "n k"] | None = None,
 ) -> Theta:
-    """Sizes by axis, and the time between two samples, of what explains most of an error by setting in.
+    """Sizes by axis, then the time, of the onset that explains most of an error.
 
-    It is a constant, or a column of `setting_in` for each axis, beside some columns and so many likelier constants. Each axis
-    counts by what is left there. In least squares a further column gains (left' x)² / x' x, both less their projection on the
-    others (Frisch and Waugh, Econometrica 1933); for all columns that set in at one time these are sums from that time on.
+    A constant sets in, or a column of `setting_in` for each axis, between two samples, beside some columns and so many likelier
+    constants. Each axis counts by what is left there. In least squares a further column gains (left' x)² / x' x, both less their
+    projection on the others (Frisch and Waugh, Econometrica 1933); for all columns that set in at one time these are sums from
+    that time on.
     """
     columns = np.ones((len(t_s), 1)) if setting_in is None else setting_in
     left, singular, _ = np.linalg.svd(beside / np.maximum(np.linalg.norm(beside, axis=0), 1e-300), full_matrices=False)

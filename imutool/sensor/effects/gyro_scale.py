@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from imutool.sensor.effect import STEP, Effect, Parameter, Stage, Theta, each_axis, residual
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis, residual
 from imutool.sensor.effects.gyro_bias_step import followed, likeliest_onset
 from imutool.sensor.samples import IdealMotion, SensorSamples
-from imutool.units import SENSORS
+from imutool.units import SENSORS, Sensor
 
+STEP = "step"  # variant of a scale that sets in at one time, also beside the scale of the whole log
 T_STEP = Parameter("t_step", "s", 30.0, begins=True)
 
 
@@ -20,7 +21,7 @@ def _forward(samples: SensorSamples, s: Theta) -> SensorSamples:
 
 
 def of_form(effect: Effect, names: Container[str]) -> Effect:
-    """A scale from one time on where `t_step` is among the parameters' names, any other effect itself."""
+    """A scale from one time on if `t_step` is among the names, any other effect itself."""
     return _from_one_time_on(effect) if effect.name in _SCALES and T_STEP.name in names else effect
 
 
@@ -34,7 +35,7 @@ def in_both_forms(effects: Sequence[Effect]) -> Iterator[Effect]:
 
 def _from_one_time_on(whole: Effect) -> Effect:
     """The scale error of a sensor that sets in: s, then the time (s from the log's start)."""
-    (sensor,) = whole.sensors
+    sensor: Sensor = "gyro" if whole.sensors == ("gyro",) else "accel"
 
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
         on = np.asarray(samples.stamp_s >= theta[3])[:, None]
