@@ -225,7 +225,8 @@ def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     effects = in_forms(effects, exact=exact)
     end_s = max(float(pair.stamp_s[-1]) for pair in pairs)
     effects = [*gyro_bias_step.repeated([*gyro_bias_drift.within(clock_wander.with_knots(effects, end_s), end_s)])]
-    effects = [*gyro_scale.in_both_forms(effects)]
+    if len({pair.name for pair in pairs}) == 1:  # else one of another sensor looks like it: `compare_findings`
+        effects = [*gyro_scale.in_both_forms(effects)]
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
     of_reference = timestamps.jitter(pairs) if exact else (SMOOTHED,)
     return (*effects, *of_reference, *timestamps.soft_limits(pairs, biases))

@@ -79,10 +79,10 @@ def likeliest_onset(
 ) -> Theta:
     """Sizes by axis, then the time, of the onset that explains most of an error.
 
-    A constant sets in, or a column of `setting_in` for each axis, between two samples, beside some columns and so many likelier
-    constants. Each axis counts by what is left there. In least squares a further column gains (left' x)² / x' x, both less their
-    projection on the others (Frisch and Waugh, Econometrica 1933); for all columns that set in at one time these are sums from
-    that time on.
+    A constant sets in, or a column of `setting_in` for each axis, between two samples, beside some columns and so many
+    likelier constants. Each axis counts by what is left there. In least squares a further column gains (left' x)² / x' x, both
+    less their projection on the others (Frisch and Waugh, Econometrica 1933); for all columns that set in at one time these
+    are sums from that time on.
     """
     columns = np.ones((len(t_s), 1)) if setting_in is None else setting_in
     left, singular, _ = np.linalg.svd(beside / np.maximum(np.linalg.norm(beside, axis=0), 1e-300), full_matrices=False)
