@@ -28,6 +28,7 @@ from imutool.inertial.preintegration import exp
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_pair
 from imutool.sensor.effects import clock_offset
+from imutool.sensor.effects.gyro_scale import T_STEP
 from imutool.sensor.linear_form import LinearForm, linear_form
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile
 from imutool.sensor.physics_file_terms import DRIVEN
@@ -173,10 +174,10 @@ def _form(file: PhysicsFile, where: Path, sensor: Sensor, place: int) -> LinearF
 
 def _is_corrected(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
     """Whether an effect can be corrected; one with a linear form is added to the parts."""
+    if T_STEP.name in entry.parameters or entry.name == DRIVEN:
+        return False
     if entry.name in MATRIX or entry.name == MOUNT:
         return True
-    if entry.name == DRIVEN:
-        return False
     (effect,) = (LATE_GYRO,) if entry.name == LATE_GYRO.name else catalogue.effects([entry.name])
     of_samples = effect.linear and effect.stage == Stage.SENSOR and not effect.needs  # its error follows from the samples alone
     if not (effect.trained or of_samples) or (effect.stage == Stage.CLOCK and abs(_value(entry, "tau")) > MOST_TAU_S):
@@ -231,7 +232,8 @@ def _of_size_one(effect: Effect, theta: Theta, sensor: Sensor) -> Part:
 
 def _matrix(file: PhysicsFile, sensor: Sensor) -> Part | None:
     """Effect I - T^-1 of nine parameters with standard deviations; none where T is I."""
-    entries = {entry.name: entry for entry in file.effect if MATRIX.get(entry.name) == sensor or entry.name == MOUNT}
+    lasting = [entry for entry in file.effect if T_STEP.name not in entry.parameters]
+    entries = {entry.name: entry for entry in lasting if MATRIX.get(entry.name) == sensor or entry.name == MOUNT}
     if not entries:
         return None
     factors, variance = [], np.zeros((3, 3))

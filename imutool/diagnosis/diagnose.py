@@ -58,7 +58,7 @@ from imutool.recording import Recording
 from imutool.sensor import catalogue
 from imutool.sensor.channels import with_channels
 from imutool.sensor.effect import Effect
-from imutool.sensor.effects import clock_wander, gyro_bias_drift, gyro_bias_step
+from imutool.sensor.effects import clock_wander, gyro_bias_drift, gyro_bias_step, gyro_scale
 
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 NEEDS_POSES = clock_wander.EFFECT.name  # one clock cannot wander against itself
@@ -225,6 +225,8 @@ def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     effects = in_forms(effects, exact=exact)
     end_s = max(float(pair.stamp_s[-1]) for pair in pairs)
     effects = [*gyro_bias_step.repeated([*gyro_bias_drift.within(clock_wander.with_knots(effects, end_s), end_s)])]
+    if len({pair.name for pair in pairs}) == 1:  # else one of another sensor looks like it: `compare_findings`
+        effects = [*gyro_scale.in_both_forms(effects)]
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
     of_reference = timestamps.jitter(pairs) if exact else (SMOOTHED,)
     return (*effects, *of_reference, *timestamps.soft_limits(pairs, biases))

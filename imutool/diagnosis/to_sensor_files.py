@@ -41,10 +41,11 @@ def start_values(findings: Sequence[Finding], candidates: Sequence[Effect]) -> C
     return tuple(found.values())
 
 
-def _likeness(finding: Finding, effect: Effect) -> tuple[bool, bool, int]:
-    """How alike an effect of the name of a finding is: its constants, its sensor, and how many constants agree."""
+def _likeness(finding: Finding, effect: Effect) -> tuple[bool, bool, int, int]:
+    """How alike an effect of the name of a finding is: its constants, sensor, how many constants agree, and parameters."""
     agree = all(finding.parameters.get(of.name, NONE).value == value for of, value in effect.constants)
-    return agree, effect.sensors == (finding.signal,), len(effect.constants)
+    known = sum(of.name in finding.parameters for of in effect.parameters)
+    return agree, effect.sensors == (finding.signal,), len(effect.constants), known
 
 
 def _started(effect: Effect, parameters: Mapping[str, Estimate]) -> tuple[Effect, Theta]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.exporting import ExportReport
-from imutool.exporting.twin import DEVIATIONS, NOISE, PHYSICS, Twin, read
+from imutool.exporting.twin import DEVIATIONS, NOISE, PHYSICS, Twin, read, sets_in
 from imutool.mcap_io.storage.target import Target, writing
 from imutool.noise import datasheet
 from imutool.sensor import physics_file
@@ -42,6 +42,7 @@ def write(source: Path, out: Path, form: str, noise: str | Path | None, overwrit
             target.write(text.encode())
     left_out = [entry.name for entry in twin.physics.effect if entry.name not in twin.used or entry.column]
     if text_of is not None:
+        left_out += [entry.name for entry in twin.physics.effect if entry.name in twin.used and sets_in(entry)]
         left_out += [f"a curve of {curve.variable}" for curve in twin.physics.unknown] + [t.term for t in twin.physics.term]
         left_out += ["the colour of the noise"] * (twin.noise.colour is not None)
     left_out += twin.of_some

@@ -20,6 +20,7 @@ from imutool.noise import datasheet
 from imutool.noise.datasheet import Noise
 from imutool.recording import GRAVITY_M_S2
 from imutool.sensor import catalogue, physics_file
+from imutool.sensor.effects import gyro_scale
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
 from imutool.units import AXES, SENSORS, Sensor, three
 
@@ -47,7 +48,7 @@ class Twin:
 
     def vector(self, effect: str) -> Vector:
         """Three parameters of an effect, zero where it is not known."""
-        entry = next((entry for entry in self.physics.effect if entry.name == effect), None)
+        entry = next((entry for entry in self.physics.effect if entry.name == effect and not sets_in(entry)), None)
         if entry is None:
             return np.zeros(3)
         self.used.add(effect)
@@ -142,7 +143,7 @@ def _of_fleet(files: list[PhysicsFile]) -> tuple[PhysicsFile, tuple[str, ...]]:
             found.setdefault(key, []).append(entries)
     common, of_some = list[Entry](), list[str]()
     for (name, *_), units in found.items():
-        if 2 * len(units) > len(files) and len({len(own) for own in units}) == 1 and not _sets_in(name):
+        if 2 * len(units) > len(files) and len({len(own) for own in units}) == 1 and not any(map(sets_in, units[0])):
             common += [_pooled(list(alike)) for alike in zip(*units, strict=True)]
         else:
             of_some.append(f"{name} of {len(units)} of {len(files)} units")
@@ -156,8 +157,10 @@ def _place(entry: Entry) -> list[float]:
     return [value.value for name, value in entry.parameters.items() if name[-1] not in AXES]
 
 
-def _sets_in(name: str) -> bool:
-    return any(effect.name == name and any(of.begins for of in effect.parameters) for effect in catalogue.effects())
+def sets_in(entry: Entry) -> bool:
+    """Whether an effect sets in at a time of its log."""
+    own = (gyro_scale.of_form(effect, entry.parameters) for effect in catalogue.effects() if effect.name == entry.name)
+    return any(of.begins for effect in own for of in effect.parameters)
 
 
 def _pooled(entries: list[Entry]) -> Entry:

@@ -20,6 +20,7 @@ from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording, seconds
 from imutool.sensor import catalogue, physics_file
+from imutool.sensor.effects import gyro_scale
 from imutool.sensor.made_up_flight import flight
 from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
 from imutool.sensor.simulate import simulate
@@ -56,7 +57,7 @@ CURVE = Curve(signal="gyro", variable="f_x", unit="m/s²", x=(-3.0, 0.0, 3.0), y
 
 def entry(name: str, values: Mapping[str, float], std: float | None = None) -> Entry:
     (physics,) = catalogue.effects([name])
-    units = {number.name: number.unit for number in physics.parameters}
+    units = {number.name: number.unit for number in gyro_scale.of_form(physics, values).parameters}
     return Entry(name=name, parameters={key: Value(value=v, std=std, unit=units[key]) for key, v in values.items()})
 
 
@@ -161,12 +162,13 @@ def test_what_cannot_be_taken_off_is_told(trajectory: Path, caplog: pytest.LogCa
     limit = entry("saturation", {"gyro_limit": 5.0})
     late = entry("clock_offset", {"tau": 2.0 * MOST_TAU_S})
     turned = entry("mount_rotation", {"phi_x": 0.1})
-    file = written(trajectory.with_name("some.toml"), limit, late, turned, entry("gyro_scale", {"x": 0.1}))
+    sets_in = entry("accel_scale", {"x": 0.1, "t_step": 20.0})
+    file = written(trajectory.with_name("some.toml"), limit, late, turned, entry("gyro_scale", {"x": 0.1}), sets_in)
     with caplog.at_level(logging.WARNING):
         model = find_model(file, RATE_HZ)
     assert isinstance(model, Model)
-    assert model.card["not_taken"] == ["saturation", "clock_offset"]
-    assert "saturation, clock_offset" in caplog.text
+    assert model.card["not_taken"] == ["saturation", "clock_offset", "accel_scale"]
+    assert "saturation, clock_offset, accel_scale" in caplog.text
     assert "body's axes" in caplog.text
 
 

@@ -17,6 +17,7 @@ from imutool.diagnosis.estimation.trial.effect_forms import in_forms
 from imutool.diagnosis.result import Estimate, Traces
 from imutool.diagnosis.to_sensor_files import start_values, to_noise_file, to_physics_file
 from imutool.sensor import catalogue, physics_file
+from imutool.sensor.effects import gyro_scale
 
 RATE_HZ, SECONDS = 200.0, 60
 
@@ -53,6 +54,14 @@ def test_a_search_begins_with_the_low_pass_of_the_sensor_and_order_that_were_fou
         ("low_pass:accel order 0", [11.0]),
         ("low_pass:gyro", [20.0]),
     ]
+
+
+def test_a_search_begins_with_the_scale_that_sets_in_where_that_was_found() -> None:
+    candidates = [*gyro_scale.in_both_forms(catalogue.diagnosed(["gyro_scale"]))]
+    whole = replace_struct(diagnoses.LEVER_ARM, effect="gyro_scale", signal="gyro", parameters={"x": Estimate(0.1, 0.01, "-")})
+    later = replace_struct(whole, parameters={"x": Estimate(0.2, 0.01, "-"), "t_step": Estimate(9.0, 0.1, "s")})
+    chosen = [(effect.key, theta.tolist()) for effect, theta in start_values([later, whole], candidates)]
+    assert chosen == [("gyro_scale:step", [0.2, 0.0, 0.0, 9.0]), ("gyro_scale", [0.1, 0.0, 0.0])]
 
 
 def test_without_samples_there_is_no_noise() -> None:

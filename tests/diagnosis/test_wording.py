@@ -378,6 +378,8 @@ def test_a_step_says_how_far_and_when() -> None:
     assert named_sentence(diagnoses.ARM, told) == (
         "its bias steps by (12.3, -4.5, 8.1) ± 0.4 mrad/s at 31.02 ± 0.05 s (gyro_bias_step)"
     )
+    told = finding("gyro_scale", {"x": Estimate(0.02, 1e-3, "-"), "t_step": Estimate(31.02, 0.05, "s")}, "gyro")
+    assert "from 31.02 ± 0.05 s on" in named_sentence(diagnoses.ARM, told)
 
 
 def test_a_clock_that_wanders_says_from_where_to_where() -> None:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.api.logs import export
 from imutool.errors import ConfigError, DataError
+from imutool.exporting.twin import read
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Colour, Noise
 from imutool.sensor import physics_file
@@ -165,6 +166,16 @@ def test_a_fleet_gives_means_and_ranges(tmp_path: Path) -> None:
 
 def _lines(*f_hz: float) -> tuple[Entry, ...]:
     return tuple(Entry(name="vibration", signal="accel", parameters={"f": Value(value=hz, unit="Hz")}) for hz in f_hz)
+
+
+def test_a_scale_that_sets_in_is_none_of_the_whole_simulation(tmp_path: Path) -> None:
+    values = {"x": Value(value=0.02, unit="-"), "t_step": Value(value=20.0, unit="s")}
+    later = Entry(name="gyro_scale", signal="gyro", parameters=values)
+    physics_file.write(PhysicsFile(effect=(later,)), tmp_path / "physics.toml")
+    datasheet.write(NOISE, tmp_path / "noise.toml")
+    twin = read(tmp_path)
+    assert not twin.vector("gyro_scale").any()
+    assert export(tmp_path, tmp_path / "out", format="mujoco").left_out[0] == "gyro_scale"
 
 
 def test_two_lines_of_a_vibration_stay_two(tmp_path: Path) -> None:

@@ -170,6 +170,13 @@ def one(file: PhysicsFile) -> tuple[Effect, Theta]:
     return pair
 
 
+def test_a_scale_with_a_time_acts_from_then_on(ideal: SensorSamples) -> None:
+    parameters = {"x": Value(value=0.5, unit="-"), "t_step": Value(value=6.0, unit="s")}
+    physics, theta = one(PhysicsFile(effect=(Entry(name="accel_scale", parameters=parameters),)))
+    gain = np.where(ideal.stamp_s >= 6.0, 1.5, 1.0)[:, None] ** [1, 0, 0]
+    np.testing.assert_allclose(physics.forward(ideal, theta).accel, ideal.accel * gain)
+
+
 def test_effects_of_other_signals_are_told_and_do_not_act(tmp_path: Path) -> None:
     friction = Entry(
         name="coulomb_friction", column="/joint_states.effort[0]", parameters={"level": Value(value=0.5, unit="N m")}

@@ -21,6 +21,7 @@ from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.effect import ONCE_MORE, Effect, Theta
 from imutool.sensor.effects import low_pass, vibration
 from imutool.sensor.effects.gyro_hysteresis import play
+from imutool.sensor.effects.gyro_scale import STEP
 
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
 SHARED, STANDS_STILL = "share", 0.4  # variant of a hysteresis; of the motion, what such a share moves at least
@@ -214,7 +215,7 @@ def unidentified(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> It
 
 def for_noise(effects: Sequence[Effect]) -> list[Effect]:
     """Effects beside which noise is measured: further steps or orders would leave too little."""
-    return [effect for effect in effects if effect.name != LOW_PASSES[1] and effect.variant not in (SHARED, *ONCE_MORE)]
+    return [effect for effect in effects if effect.name != LOW_PASSES[1] and effect.variant not in (SHARED, STEP, *ONCE_MORE)]
 
 
 def exclude_each_other(a: Effect, b: Effect) -> bool:
@@ -222,7 +223,7 @@ def exclude_each_other(a: Effect, b: Effect) -> bool:
 
     Variants of one effect on one sensor do not, but for what acts several times, nor what replaces another.
     """
-    if a.key != b.key and a.name == b.name and {a.variant, b.variant} <= {"", *ONCE_MORE}:
+    if a.key != b.key and a.name == b.name and {a.variant, b.variant} <= {"", STEP, *ONCE_MORE}:
         return False
     one_sensor = a.sensors == b.sensors or bool(set(a.sensors) & set(b.sensors))
     variants = a.kind == b.kind == "catalogue" and a.name == b.name and one_sensor

@@ -173,8 +173,9 @@ def _dilution(
     for effect, _ in found.chosen:
         for signal, columns in logs[0].pair.signals.items():
             if effect.name == SCALES.get(signal):
-                column = [columns.start + AXES.index(parameter.name) for parameter in effect.parameters]
-                out[effect.key] = squares[column] * np.diag(by_information)[found.place(effect.key)]
+                column = [columns.start + AXES.index(parameter.name) for parameter in effect.parameters if not parameter.begins]
+                out[effect.key] = np.where(sets_in(effect), 0.0, np.diag(by_information)[found.place(effect.key)])
+                out[effect.key][~sets_in(effect)] *= squares[column]
     return out
 
 

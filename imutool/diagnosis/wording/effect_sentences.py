@@ -156,8 +156,8 @@ def _reference_error(w: Words) -> str:
 SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "gyro_bias": "{w.it} reads a constant {w.main} too much",
     "accel_bias": "{w.it} reads a constant {w.main} too much",
-    "gyro_scale": "its scale is off by {w.main}",
-    "accel_scale": "its scale is off by {w.main}",
+    "gyro_scale": (scale := lambda w: f"its scale is off by {w.main}{f' from {w.rest[0]} on' if w.rest else ''}"),
+    "accel_scale": scale,
     "gyro_scale_asymmetry": "its scale for positive readings exceeds that for negative ones by {w.main}",
     "accel_scale_asymmetry": "its scale for positive readings exceeds that for negative ones by {w.main}",
     "gyro_misalignment": "its axes are not square: one shows on another by {w.main}",

@@ -57,51 +57,65 @@ def repeated(effects: Sequence[Effect]) -> Iterator[Effect]:
 def _starts(sensor: int, before: int, motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     """The likeliest step with so many likelier ones before it, beside each trend."""
     error, t_s = residual(motion, samples)[sensor], samples.stamp_s
-    followed = _followed(motion.sample(t_s, t_s))
+    others = followed(motion.sample(t_s, t_s))
     trends = (np.vander((t_s - t_s[0]) / np.ptp(t_s), degree + 1) for degree in TREND_DEGREES)
-    return [_likeliest(t_s, error, np.concatenate([trend, followed], axis=1), before) for trend in trends]
+    return [likeliest_onset(t_s, error, np.concatenate([trend, others], axis=1), before) for trend in trends]
 
 
-def _followed(ideal: SensorSamples) -> Float64[np.ndarray, "n q"]:
-    """What most other errors follow: both signals (scale, mount), changes of both (clock), products of rates (an arm)."""
+def followed(ideal: SensorSamples) -> Float64[np.ndarray, "n q"]:
+    """Signals (scale, mount), their changes (clock), products of rates (an arm)."""
     products = np.stack([ideal.gyro[:, i] * ideal.gyro[:, j] for i in range(3) for j in range(i + 1)], axis=1)
     return np.concatenate(
         [ideal.gyro, ideal.accel, ideal.alpha, np.gradient(ideal.accel, ideal.stamp_s, axis=0), products], axis=1
     )
 
 
-def _likeliest(
-    t_s: Float64[np.ndarray, " n"], error: Float64[np.ndarray, "n 3"], beside: Float64[np.ndarray, "n q"], before: int
+def likeliest_onset(
+    t_s: Float64[np.ndarray, " n"],
+    error: Float64[np.ndarray, "n 3"],
+    beside: Float64[np.ndarray, "n q"],
+    before: int = 0,
+    setting_in: Float64[np.ndarray, "n k"] | None = None,
 ) -> Theta:
-    """The step, between two samples, that explains most of an error beside some columns and so many likelier steps.
+    """Sizes by axis, then the time, of the onset that explains most of an error.
 
-    Each axis counts by what is left there. In least squares a further column gains (left' x)² / x' x, both less their
-    projection on the others (Frisch and Waugh, Econometrica 1933); for all columns that set in at one time these are sums from
-    that time on.
+    A constant sets in, or a column of `setting_in` for each axis, between two samples, beside some columns and so many
+    likelier constants. Each axis counts by what is left there. In least squares a further column gains (left' x)² / x' x, both
+    less their projection on the others (Frisch and Waugh, Econometrica 1933); for all columns that set in at one time these
+    are sums from that time on.
     """
+    columns = np.ones((len(t_s), 1)) if setting_in is None else setting_in
     left, singular, _ = np.linalg.svd(beside / np.maximum(np.linalg.norm(beside, axis=0), 1e-300), full_matrices=False)
     basis = left[:, singular > INDEPENDENT * singular[0]]
-    size, row = _largest(t_s, error, basis)
+    size, row = _largest(t_s, error, basis, columns)
     for _ in range(before):
         step = (np.arange(len(t_s)) > row).astype(np.float64)
         step -= basis @ (basis.T @ step)
         basis = np.column_stack([basis, step / np.linalg.norm(step)])
-        size, row = _largest(t_s, error, basis)
+        size, row = _largest(t_s, error, basis, columns)
     return np.append(size, (t_s[row] + t_s[row + 1]) / 2.0)
 
 
 def _largest(
-    t_s: Float64[np.ndarray, " n"], error: Float64[np.ndarray, "n 3"], basis: Float64[np.ndarray, "n q"]
+    t_s: Float64[np.ndarray, " n"],
+    error: Float64[np.ndarray, "n 3"],
+    basis: Float64[np.ndarray, "n q"],
+    columns: Float64[np.ndarray, "n k"],
 ) -> tuple[Float64[np.ndarray, "3"], int]:
-    """Size of the step that explains most beside orthonormal columns, and the sample before it."""
+    """Size of what explains most by setting in, beside orthonormal columns, and the sample before it."""
     rest = error - basis @ (basis.T @ error)
-    after = np.cumsum(basis[::-1], axis=0)[::-1][1:]
-    own = np.arange(len(t_s) - 1, 0, -1) - (after**2).sum(axis=1)
-    sums = np.cumsum(rest[::-1], axis=0)[::-1][1:]
-    size = sums / np.maximum(own, 1.0)[:, None]
+    own = [_from_on(x**2) - (_from_on(basis * x[:, None]) ** 2).sum(axis=1) for x in columns.T]
+    least = np.maximum((columns**2).mean(axis=0), np.finfo(np.float64).tiny)
+    sums = _from_on(rest * columns)
+    size = sums / np.maximum(np.stack(own, axis=1), least)
     gain = (sums * size / np.maximum((rest**2).mean(axis=0), np.finfo(np.float64).tiny)).sum(axis=1)
     row = int(np.argmax(np.where((t_s[1:] > t_s[0] + EDGE_S) & (t_s[:-1] < t_s[-1] - EDGE_S), gain, 0.0)))
     return size[row], row
+
+
+def _from_on(x: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "n-1 ..."]:
+    """Sums of the samples behind each but the last."""
+    return np.asarray(np.cumsum(x[::-1], axis=0)[::-1][1:])
 
 
 EFFECT = bias_step("gyro", "rad/s", 0.02)

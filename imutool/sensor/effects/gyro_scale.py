@@ -1,15 +1,67 @@
-"""Scale error of the gyro: omega (1 + s), per axis."""
+"""Scale error of the gyro: omega (1 + s), per axis; with `t_step` from one time on."""
 
 from __future__ import annotations
 
-from imutool.sensor.effect import Effect, Stage, Theta, each_axis
-from imutool.sensor.samples import SensorSamples
+from collections.abc import Container, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis, residual
+from imutool.sensor.effects.gyro_bias_step import followed, likeliest_onset
+from imutool.sensor.samples import IdealMotion, SensorSamples
+from imutool.units import SENSORS, Sensor
+
+STEP = "step"  # variant of a scale that sets in at one time, also beside the scale of the whole log
+T_STEP = Parameter("t_step", "s", 30.0, begins=True)
 
 
 def _forward(samples: SensorSamples, s: Theta) -> SensorSamples:
     return samples.with_readings(gyro=samples.gyro * (1.0 + s))
 
 
+def of_form(effect: Effect, names: Container[str]) -> Effect:
+    """A scale from one time on if `t_step` is among the names, any other effect itself."""
+    return _from_one_time_on(effect) if effect.name in _SCALES and T_STEP.name in names else effect
+
+
+def in_both_forms(effects: Sequence[Effect]) -> Iterator[Effect]:
+    """Effects, and behind each scale one that sets in at one time."""
+    for effect in effects:
+        yield effect
+        if effect.name in _SCALES:
+            yield _from_one_time_on(effect)
+
+
+def _from_one_time_on(whole: Effect) -> Effect:
+    """The scale error of a sensor that sets in: s, then the time (s from the log's start)."""
+    sensor: Sensor = "gyro" if whole.sensors == ("gyro",) else "accel"
+
+    def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
+        on = np.asarray(samples.stamp_s >= theta[3])[:, None]
+        return samples.with_added(sensor, on * theta[:3] * getattr(samples, sensor))
+
+    def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
+        """The likeliest time at which the scale changes, beside what most other errors follow."""
+        ideal, t_s = motion.sample(samples.stamp_s, samples.stamp_s), samples.stamp_s
+        error = residual(motion, samples)[SENSORS.index(sensor)]
+        others = np.column_stack([np.ones(len(t_s)), followed(ideal)])
+        return [likeliest_onset(t_s, error, others, setting_in=getattr(ideal, sensor))]
+
+    return replace(
+        whole,
+        equation=f"{whole.equation} from t_step on",
+        parameters=(*whole.parameters, T_STEP),
+        forward=forward,
+        linear=False,
+        starts=starts,
+        alternatives=lambda samples: len(samples.stamp_s),
+        variant=STEP,
+        trained=False,
+    )
+
+
+_SCALES = ("gyro_scale", "accel_scale")
 EFFECT = Effect(
     "gyro_scale",
     Stage.SENSOR,

@@ -30,7 +30,7 @@ from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked
 from imutool.sensor import catalogue
-from imutool.sensor.effects import clock_wander, gyro_bias_drift, gyro_bias_step
+from imutool.sensor.effects import clock_wander, gyro_bias_drift, gyro_bias_step, gyro_scale
 from imutool.sensor.samples import IdealMotion
 
 SURE = 4.0
@@ -159,6 +159,17 @@ def test_a_step_of_a_bias_is_found_wherever_it_lies(case: str) -> None:
     found = asked(planted.pair(planted.rich(), STEPS[case], 3), beyond=False)
     assert sorted(names(found)) == sorted(STEPS[case])
     assert all(sure(found, name, theta) for name, theta in STEPS[case].items())
+
+
+@pytest.mark.parametrize(("sensor", "scale"), [("gyro", [0.05, -0.03, 0.04]), ("accel", [0.02, 0.03, -0.02])])
+def test_a_scale_that_sets_in_is_that_scale_with_its_time(sensor: str, scale: list[float]) -> None:
+    """It was a scale that grows with the time, and steps of the bias."""
+    motion = planted.rich()
+    added = np.where(np.arange(6) // 3 == ("gyro", "accel").index(sensor), [*scale, *scale], 0.0) * planted.ideal(motion)
+    pair = planted.pair(motion, {}, 3, added=added * (motion.t_s >= 13.3)[:, None])
+    (one,) = select_effects([planted.weighed(pair)], tuple(gyro_scale.in_both_forms(planted.catalogue()))).selected
+    assert (one.effect.name, [parameter.name for parameter in one.effect.parameters]) == (f"{sensor}_scale", [*"xyz", "t_step"])
+    assert (np.abs(one.theta - [*scale, 13.3]) < SURE * one.std).all()
 
 
 def several_times(pair: Pair) -> Selection:
