@@ -16,6 +16,7 @@ BLOCK = 4096  # samples: what rules see at a time depends on the log alone, not 
 STEP_NS = nanoseconds(0.1)
 STEP_S = 0.1  # of `Motion`
 MOST_FRAMES = 4  # that a warning names
+MOST_COUNTED = 1000  # a hostile log names another frame in each message
 MOST_RATES = 20_000  # samples of the gyro that are kept as they are: 480 kB
 
 Numbers = Int64[np.ndarray, " n"]
@@ -42,17 +43,19 @@ def joined(parts: list[Samples]) -> Samples:
 def counted_frames(batches: Iterable[ImuBatch], frames: Counter[str]) -> Iterator[ImuBatch]:
     """The batches; their messages are counted by frame as they come."""
     for batch in batches:
-        frames[batch.frame_id.lstrip("/")] += len(batch.stamp_ns)
+        frame = batch.frame_id.lstrip("/")
+        if frame in frames or len(frames) < MOST_COUNTED:
+            frames[frame] += len(batch.stamp_ns)
         yield batch
 
 
 def frame_words(frames: Mapping[str, int]) -> list[str]:
-    """Warning about an IMU whose messages name several frames; none for one frame."""
-    if len(frames) < 2:
+    """Warning about an IMU whose messages name several frames; no name is no frame."""
+    named = [f"{frame} ({count})" for frame, count in frames.items() if frame]
+    if len(named) < 2:
         return []
-    named = [f"{frame or 'none'} ({count})" for frame, count in [*frames.items()][:MOST_FRAMES]]
-    more = ", …" if len(frames) > MOST_FRAMES else ""
-    return [f"the messages name {len(frames)} frames: {', '.join(named)}{more}; several sensors have no common bias"]
+    some = ", ".join(named[:MOST_FRAMES]) + ", …" * (len(named) > MOST_FRAMES)
+    return [f"the messages name {len(named)} frames: {some}; several sensors have no common bias"]
 
 
 def blocks(batches: Iterable[ImuBatch]) -> Iterator[Samples]:

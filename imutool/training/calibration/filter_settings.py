@@ -55,7 +55,7 @@ def _turn_error(model: BiasModel, pool: Pool) -> dict[str, float]:
     for log in range(len(pool.names)):
         if (root_at := model.calibration_covariance()) is None:
             return {}
-        rows, total = np.flatnonzero((pool.log == log).cpu().numpy()), 0.0
+        rows, total = np.flatnonzero((pool.log == log).cpu().numpy()), np.zeros(())
         for first in range(0, len(rows), AT_ONCE):
             some = rows[first : first + AT_ONCE]
             t_s, gyro, accel = (x[some].cpu().double().numpy() for x in (pool.t, pool.gyro, pool.accel))

@@ -7,6 +7,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import rerun as rr
 
@@ -50,7 +51,8 @@ def late(timeline: str) -> Plant:
         make = rr.TimeColumn.__init__
 
         def made(self: Any, name: str, **times: Any) -> None:
-            make(self, name, **{kind: t + LATE_NS if name == timeline else t for kind, t in times.items()})
+            late_by = np.timedelta64(LATE_NS if name == timeline else 0, "ns")
+            make(self, name, **{kind: t + late_by for kind, t in times.items()})
 
         patch.setattr(rr.TimeColumn, "__init__", made)
 
