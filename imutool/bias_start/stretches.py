@@ -19,7 +19,7 @@ from imutool.bias.model import GAP_S
 from imutool.cleaning import rows
 from imutool.cleaning.rules.saturation import at_limit
 from imutool.cleaning.rules.stuck import repeated
-from imutool.cleaning.samples import frame_words
+from imutool.cleaning.samples import count_frame, frame_words
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.file_location import Location
 from imutool.mcap_io.codec.decode import ImuBatch
@@ -220,7 +220,7 @@ class Sieve:
         Raises:
             LogError: a stamp that repeats, or goes back by less than `GAP_S`.
         """
-        self.frames[batch.frame_id.lstrip("/")] += len(batch.stamp_ns)
+        count_frame(batch, self.frames)
         reasons = unmeasured(batch.gyro, batch.accel)
         bad = np.logical_or.reduce(list(reasons.values()))
         if bad.any():

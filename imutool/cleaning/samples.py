@@ -43,10 +43,15 @@ def joined(parts: list[Samples]) -> Samples:
 def counted_frames(batches: Iterable[ImuBatch], frames: Counter[str]) -> Iterator[ImuBatch]:
     """The batches; their messages are counted by frame as they come."""
     for batch in batches:
-        frame = batch.frame_id.lstrip("/")
-        if frame in frames or len(frames) < MOST_COUNTED:
-            frames[frame] += len(batch.stamp_ns)
+        count_frame(batch, frames)
         yield batch
+
+
+def count_frame(batch: ImuBatch, frames: Counter[str]) -> None:
+    """Add the messages of a batch to those of its frame."""
+    frame = batch.frame_id.lstrip("/")
+    if frame in frames or len(frames) < MOST_COUNTED:
+        frames[frame] += len(batch.stamp_ns)
 
 
 def frame_words(frames: Mapping[str, int]) -> list[str]:
