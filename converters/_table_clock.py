@@ -80,6 +80,9 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
     if re.match(OWN_TIME["gyro"], spelled[column][1]):
         own = [c for c in found if re.match(OWN_TIME["accel"], spelled[c][1]) and names[c][1] == names[column][1]]
         proposal.entries |= {"accel_time": own[0]} if own else {}
+    elif times := _repeated_times(found, columns, proposal):
+        proposal.entries |= times
+        column = times["time"]
     _propose_time_unit(proposal, column, names, columns)
     if column in counters and "time_unit" in proposal.open:
         proposal.hints.append(
@@ -121,6 +124,22 @@ def _unnamed_time(
         "alone rises as a time since 1970 does": [c for c in fits if _is_of_this_century(columns.values[c].astype(float))],
     }
     return next(((why, each) for why, each in tries.items() if len(each) == 1), ("", []))
+
+
+def _repeated_times(found: list[str], columns: Columns, proposal: Proposal) -> dict[str, str]:
+    """Times of gyro and accelerometer where a time of one name stands in front of each: `time, ax, ..., time, gx, ...`.
+
+    A name that repeats was told apart by a number, or by the column in front of it (`distinct_names`).
+    """
+    order, base, own = [*columns.values], min(found, key=len), dict[str, str]()
+    for entry, sensor in (("time", "gyro"), ("accel_time", "accel")):
+        place = min(map(order.index, proposal.unsigned(sensor, columns)), default=0)
+        before = order[place - 1] if place else ""
+        names = {base, f"{order[place - 2]}.{base}"} if place > 1 else {base}
+        if not ((before in names or re.fullmatch(rf"{re.escape(base)}[._]\d+", before)) and rises(columns.values[before])):
+            return {}
+        own[entry] = before
+    return {} if np.array_equal(columns.values[own["time"]], columns.values[own["accel_time"]]) else own
 
 
 def _steadiest_first(found: list[str], spelled: dict[str, tuple[str, str]], columns: Columns, proposal: Proposal) -> list[str]:
