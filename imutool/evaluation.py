@@ -43,7 +43,6 @@ DELAY_WINDOW_S = 1.0  # of the windows that show a delay of the poses
 CLEAR_STDS, MOST_DRIFT_LEFT = 4.0, 0.9  # of a clear delay: deviations, and share of the drift that is left without it
 DRIFTS = "drift_orientation_deg", "drift_velocity_m_s", "drift_orientation_std_deg", "drift_velocity_std_m_s"
 DELAY = "pose_delay_s", "pose_delay_std_s", "aoe_without_delay_deg", "drift_orientation_without_delay_deg"
-DEG = 180.0 / np.pi
 PURE, AIDED = "integration", "aided"
 Refused = Callable[[str, ImutoolError], None]
 Figures = dict[str, float | None]
@@ -200,7 +199,8 @@ def _drift(
         for name, column in zip(DRIFTS, np.concatenate(squares, axis=1), strict=False):  # without a model two
             is_angle = name.endswith("deg")
             if is_angle or has_positions:
-                out[name] = float(np.sqrt(column.mean())) * (DEG if is_angle else 1.0)
+                rms = np.sqrt(column.mean())
+                out[name] = float(np.rad2deg(rms) if is_angle else rms)
     return out
 
 

@@ -13,7 +13,7 @@ from imutool.array_types import Float64
 from imutool.inertial import stationary
 from imutool.noise import allan
 from imutool.recording import Imu
-from imutool.units import AXES, SENSORS, UNITS, Sensor
+from imutool.units import AXES, NOUNS, SENSORS, UNITS, Sensor
 from imutool.viewing.html.drawing import Panel, Picture, at_least_three_ticks, decades, legend, plain_tick_labels
 from imutool.viewing.html.page import AXIS_COLORS, INK, SOFT, TITLES
 from imutool.viewing.html.report_paths import color_of, style_of
@@ -29,7 +29,6 @@ SIGMAS = 3.0
 ROUNDING = 1e-7  # of the largest density: below is the rounding of a difference that is constant
 BAND_POINTS = 300
 MIN_REST_S = 4.0  # in one piece, for an Allan deviation
-NOUNS = {"gyro": "Angular rate", "accel": "Specific force"}
 
 Vectors = Float64[np.ndarray, "_ 3"]
 Values = Float64[np.ndarray, " _"]
