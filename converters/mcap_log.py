@@ -190,9 +190,7 @@ def _ends_whole(file: BinaryIO) -> bool:
     return end == MAGIC
 
 
-def read_parts(
-    sequence: Sequence, paths: list[Path], remarks: Remarks, *, images: bool = True, define: Define = as_defined
-) -> MessageLog:
+def read_parts(sequence: Sequence, paths: list[Path], remarks: Remarks, *, images: bool, define: Define) -> MessageLog:
     """Message log of the parts of a ROS 2 bag, one after the other.
 
     An unfinished one is read up to its end.

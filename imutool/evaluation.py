@@ -224,7 +224,7 @@ def _without_delay(imu: Imu, span: TrueSpan, recording: Recording, drift_deg: fl
 
 
 def _corrected(
-    imu: Imu, model: BiasModel | None, start: InitialBias | None, *, with_std: bool = False
+    imu: Imu, model: BiasModel | None, start: InitialBias | None, *, with_std: bool
 ) -> tuple[Imu, Float64[np.ndarray, "n 6"] | None]:
     """Samples corrected by a model, on request with the deviation of its bias; without one as they are."""
     if model is None or start is None:

@@ -84,21 +84,6 @@ def absolute_blocks(blocks: PathBlocks) -> Figures:
     return _finite(sums.figures(blocks))
 
 
-def relative(estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[float] = DISTANCES_M) -> dict[str, Figures]:
-    """Relative errors `roe_deg` and `rpe_m`, keyed by the distance in metres ("5").
-
-    None if the true path is too short.
-
-    Raises:
-        DataError: stamps differ, or no row is valid.
-        NumericsError: a figure is not finite.
-    """
-    pairs = RelativeErrors(distances_m)
-    for block in _blocks_of(estimate, truth, valid)():
-        pairs.add(*block.scored())
-    return _finite_pairs(pairs)
-
-
 def write_tum(parts: Iterable[Poses], path: Path, overwrite: bool = False) -> None:
     """Write `t x y z qx qy qz qw` lines (TUM RGB-D format) of poses in blocks.
 

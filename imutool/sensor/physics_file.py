@@ -56,7 +56,6 @@ from imutool.sensor.effects import gyro_scale, low_pass
 from imutool.sensor.physics_file_terms import DRIVEN, VARIABLES
 from imutool.units import SENSORS, Sensor, Three
 
-SCHEMA = "imutool.physics/1"
 OTHER = "# Of another signal than the IMU's: simulate and debias do not apply it."
 NotNegative = Annotated[float, Meta(ge=0.0)]
 ThreeStd = tuple[NotNegative, NotNegative, NotNegative]

@@ -16,7 +16,7 @@ from support.evo import statistics
 from support.nees import consistency
 
 from imutool.errors import ConfigError, DataError, NumericsError
-from imutool.inertial.metrics import absolute, evaluate, relative, write_tum
+from imutool.inertial.metrics import absolute, evaluate, write_tum
 from imutool.inertial.scoring.alignment import align
 from imutool.inertial.scoring.relative_errors import pairs_by_distance
 from imutool.recording import Poses
@@ -117,7 +117,7 @@ def test_relative_figures_equal_those_of_evo(
     pair: tuple[Poses, Poses, np.ndarray, Path], evos: Any, figure: str, distance_m: str
 ) -> None:
     estimate, truth, valid, _ = pair
-    got = relative(estimate, truth, valid)[figure][distance_m]
+    got = evaluate(estimate, truth, valid)[figure][distance_m]
     assert got == pytest.approx(evos[figure, distance_m]["mean"], rel=EVO_TOLERANCE)
     assert got is not None
     assert got > 0.1
@@ -159,7 +159,7 @@ def test_aligned_and_relative_figures_do_not_depend_on_the_frame_of_the_estimate
     mask = everything(truth)
     for name in ("aoe_aligned_deg", "ape_aligned_m"):
         assert absolute(elsewhere, truth, mask)[name] == pytest.approx(absolute(estimate, truth, mask)[name], abs=1e-6)
-    here, there = relative(estimate, truth, mask, (2.0,)), relative(elsewhere, truth, mask, (2.0,))
+    here, there = evaluate(estimate, truth, mask, (2.0,)), evaluate(elsewhere, truth, mask, (2.0,))
     assert there["roe_deg"]["2"] == pytest.approx(here["roe_deg"]["2"], abs=1e-6)
     assert there["rpe_m"]["2"] == pytest.approx(here["rpe_m"]["2"], abs=1e-6)
 
@@ -238,7 +238,7 @@ def test_diverged_numbers_are_refused() -> None:
         with pytest.raises(NumericsError):
             function(away, truth, everything(truth))
     with pytest.raises(NumericsError, match="rpe_m 5"):
-        relative(Poses(truth.t_ns, truth.p_wb * 1e200, truth.q_wb_wxyz), wander(300, seed=13, speed_m_s=5), everything(truth))
+        evaluate(Poses(truth.t_ns, truth.p_wb * 1e200, truth.q_wb_wxyz), wander(300, seed=13, speed_m_s=5), everything(truth))
 
 
 def test_trajectories_that_do_not_match_are_refused() -> None:
