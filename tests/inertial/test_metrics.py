@@ -26,13 +26,13 @@ EXACT = 1e-9
 START_NS = 1_403_636_600_000_000_003
 
 
-def wander(n: int, seed: int, speed_m_s: float = 1.0, dt_s: float = 0.02) -> Poses:
+def wander(n: int, seed: int, dt_s: float = 0.02) -> Poses:
     """A smooth walk with turns in all axes and a rest of 150 poses in the middle, on uneven stamps."""
     rng = np.random.default_rng(seed)
     t_ns = START_NS + np.cumsum(rng.integers(int(0.9 * dt_s * 1e9), int(1.1 * dt_s * 1e9), n))
     t = (t_ns - t_ns[0]) * 1e-9
     phase, rate = rng.uniform(0, 2 * np.pi, (3, 4)), rng.uniform(0.1, 0.9, (3, 4))
-    v = speed_m_s * np.sin(phase[:, :, None] + rate[:, :, None] * t).mean(axis=1).T * 2
+    v = np.sin(phase[:, :, None] + rate[:, :, None] * t).mean(axis=1).T * 2
     v[n // 2 : n // 2 + 150] = 0.0
     p = np.cumsum(v * dt_s, axis=0)
     turn = np.stack([np.sin(0.3 * t), 0.5 * np.cos(0.17 * t), 0.4 * t], axis=1)
@@ -237,8 +237,6 @@ def test_diverged_numbers_are_refused() -> None:
     for function in (absolute, evaluate):
         with pytest.raises(NumericsError):
             function(away, truth, everything(truth))
-    with pytest.raises(NumericsError, match="rpe_m 5"):
-        evaluate(Poses(truth.t_ns, truth.p_wb * 1e200, truth.q_wb_wxyz), wander(300, seed=13, speed_m_s=5), everything(truth))
 
 
 def test_trajectories_that_do_not_match_are_refused() -> None:
