@@ -19,7 +19,7 @@ from imutool.viewing.html.page import AXIS_COLORS, INK, SOFT, TITLES
 from imutool.viewing.html.report_paths import color_of, style_of
 from imutool.viewing.html.report_wording import best_run, format_number, run_name, worst_orientation_error
 from imutool.viewing.model.decimation import average_log_bins, decimate_extremes
-from imutool.viewing.model.run_data import Run, RunData, Spectrum, Trace, round_up_125, spectra
+from imutool.viewing.model.run_data import RunData, Spectrum, Trace, round_up_125, spectra
 
 HEIGHT_INCH, SAMPLES_INCH = 4.2, 5.2
 TAIL = 0.005  # of the samples: spikes may cross into the next run
@@ -79,7 +79,8 @@ def spectrum(data: RunData) -> Picture | None:
     }
     if not any(curves.values()):
         return None
-    subtracted = [(trace, _subtracted(trace.run)) for trace in data.models()]
+    removed = ((trace, Imu(trace.run.imu.t_ns, trace.run.gyro_bias, trace.run.accel_bias)) for trace in data.models())
+    subtracted = [(trace, spectra(bias)) for trace, bias in removed]
     panels = [
         Panel(
             partial(_draw_spectrum, data=data, sensor=sensor, curves=curves[sensor], subtracted=subtracted),
@@ -92,11 +93,6 @@ def spectrum(data: RunData) -> Picture | None:
     caption = "Amplitude density of the samples (Welch), up to half their rate."
     caption += " Dashed: the difference, raw minus debiased; it is small where the curves coincide." * bool(subtracted)
     return Picture("spectrum", "Spectra", caption, tuple(panels))
-
-
-def _subtracted(run: Run) -> Mapping[str, Spectrum]:
-    """Spectra of raw minus debiased."""
-    return spectra(Imu(run.imu.t_ns, run.gyro_bias, run.accel_bias))
 
 
 def allan_deviation(data: RunData) -> Picture | None:
