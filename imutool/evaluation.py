@@ -26,6 +26,7 @@ from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids, parse_aids
+from imutool.inertial.metrics import Figures
 from imutool.inertial.scoring.path_blocks import PathBlocks, TrueSpan, in_memory, integrated, pieces
 from imutool.inertial.scoring.pose_delay import pose_delay
 from imutool.inertial.strapdown import StartPose, drift_windows, gaps_crossed, window_drift, with_velocity
@@ -45,7 +46,6 @@ DRIFTS = "drift_orientation_deg", "drift_velocity_m_s", "drift_orientation_std_d
 DELAY = "pose_delay_s", "pose_delay_std_s", "aoe_without_delay_deg", "drift_orientation_without_delay_deg"
 PURE, AIDED = "integration", "aided"
 Refused = Callable[[str, ImutoolError], None]
-Figures = dict[str, float | None]
 
 
 def evaluate(

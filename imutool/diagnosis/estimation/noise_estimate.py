@@ -22,6 +22,7 @@ from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, expected
 from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, Whitener, level, settled, whitener
 from imutool.diagnosis.settings import BandSettings
 from imutool.errors import DataError
+from imutool.noise.bias_walk import INDEPENDENT
 from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.effects import vibration
@@ -31,7 +32,6 @@ logger = logging.getLogger(__name__)
 RIDGE = 1e-8
 LEAST_ROWS = 2  # times the order of the noise model: rows that follow others without a gap
 ALL_SLOW, SLOW_ORDER = 0.9, 4  # of the frequencies, from which on nothing is fast; order of the filter
-INDEPENDENT = 1e-3  # of the largest singular value, below which a column is a combination of others
 Axes = Float64[np.ndarray, " _"]
 EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the bands in which the poses are checked
 
