@@ -168,13 +168,13 @@ def read(path: Path) -> PhysicsFile:
     return file
 
 
-def write(file: PhysicsFile, path: Path, *, overwrite: bool = False) -> None:
+def write(file: PhysicsFile, path: Path) -> None:
     """Write a physics.toml, which `read` gives back bit for bit.
 
     Raises:
-        ConfigError: the file exists (without `overwrite`), or cannot be written.
+        ConfigError: the file exists, or cannot be written.
     """
-    with Target(path, overwrite=overwrite) as target:
+    with Target(path) as target:
         target.write(to_toml(file).encode())
 
 

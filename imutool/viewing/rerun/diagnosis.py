@@ -30,9 +30,9 @@ UNSEEN_COLOR: Color = (122, 122, 122)
 UNSEEN_TEXTS = ("unseen by any fit from here", "seen again from here")
 
 
-def save(d: Diagnosis, path: Path, *, overwrite: bool = False) -> None:
+def save(d: Diagnosis, path: Path) -> None:
     """Write the .rrd file (ConfigError: no Rerun, or the file exists or cannot be written)."""
-    with Target(path, overwrite=overwrite) as target:  # refuses before the work is done, leaves nothing after a failure
+    with Target(path) as target:  # refuses before the work is done, leaves nothing after a failure
         target.write(rrd(d))
 
 

@@ -163,14 +163,12 @@ def test_reruns_own_verifier_accepts_the_file(folder: Path, name: str) -> None:
     assert run.returncode == 0, run.stderr
 
 
-def test_an_existing_file_is_kept_unless_told_otherwise(tmp_path: Path) -> None:
+def test_an_existing_file_is_kept(tmp_path: Path) -> None:
     target = tmp_path / "view.rrd"
     target.write_bytes(b"mine")
     with pytest.raises(ConfigError, match="exists"):
         view.save(diagnoses.NOTHING, target)
     assert target.read_bytes() == b"mine"
-    view.save(diagnoses.NOTHING, target, overwrite=True)
-    assert "/report" in read(target)
     assert [path.name for path in tmp_path.iterdir()] == ["view.rrd"]
 
 
