@@ -243,7 +243,9 @@ def _blocks(log: WhitenedLog, found: Fit, k: int, part: str, block_s: float) -> 
 # ── onsets ──
 
 
-def estimate_onsets(logs: Sequence[WhitenedLog], found: Fit, inflation: float) -> tuple[Fit, dict[tuple[str, int], float]]:
+def estimate_onsets(
+    logs: Sequence[WhitenedLog], found: Fit, part: str, inflation: float
+) -> tuple[Fit, dict[tuple[str, int], float]]:
     """Fit with each onset at its posterior mean, and standard deviations (s).
 
     Nothing is smooth in an onset, so the times near it are searched. A time is as likely as exp(-squares / 2), the squares
@@ -258,12 +260,12 @@ def estimate_onsets(logs: Sequence[WhitenedLog], found: Fit, inflation: float) -
             step_s = max(period_s, 2.0 * settings.onset_near_s / (settings.onset_times - 1))
             t_s = theta[j] + step_s * np.arange(-(settings.onset_times // 2), settings.onset_times // 2 + 1)
             moved = (with_value(found.chosen, k, j, float(t)) for t in t_s)  # all else as it is but for the constants
-            squares = np.array([fit(logs, chosen, part="all", iterations=0, near=found).objective for chosen in moved])
+            squares = np.array([fit(logs, chosen, part=part, iterations=0, near=found).objective for chosen in moved])
             likely = np.exp(-(squares - squares.min()) / (2.0 * inflation))
             likely /= likely.sum()
             mean = float(likely @ t_s)
             spread[effect.key, j] = float(np.sqrt(likely @ (t_s - mean) ** 2 + step_s**2 / 12.0))
-            found = fit(logs, with_value(found.chosen, k, j, mean), part="all", iterations=0, near=found)
+            found = fit(logs, with_value(found.chosen, k, j, mean), part=part, iterations=0, near=found)
     return found, spread
 
 

@@ -81,7 +81,7 @@ class Trial:
                 now = fit(now.logs, reduced)
                 unseen.end()
                 continue
-            whole, self.onset_std = estimate_onsets(now.logs, whole, max(1.0, whole.reduced_chi_square))
+            whole, self.onset_std = estimate_onsets(now.logs, whole, "all", max(1.0, whole.reduced_chi_square))
             verdicts = self.verdicts(whole, first, unseen)
             unseen.end()
             rates = [*(verdict.false_discovery_rate for verdict in verdicts), 1.0][: len(now.chosen) - first]

@@ -35,7 +35,7 @@ def with_bias_walk(found: Fit) -> Fit:
     return fit(logs, found.chosen, part=found.part, hold_onsets=True)
 
 
-def squares_of_walk(found: Fit, like: Fit, *, of_any_speed: bool) -> float:
+def squares_of_walk(found: Fit, like: Fit, *, of_any_speed: bool = False) -> float:
     """Squares that random walks of the biases explain of a fit's residual.
 
     They are twice the gain in log-likelihood, and what the fit itself did not reach; none of a sensor whose noise has its walk
