@@ -46,9 +46,7 @@ def identity(format: str, sequence: Sequence, sensor: str, known: bool) -> dict[
     return {"format": format, "sequence": sequence.name, **origin, **({"sensor": sensor} if sensor else {})}
 
 
-def recording(
-    sequence: Sequence, *, dataset: str, sensor: str, known: bool, truths: dict[str, str], images: bool = True
-) -> Recording:
+def recording(sequence: Sequence, *, dataset: str, sensor: str, known: bool, truths: dict[str, str], images: bool) -> Recording:
     """Recording of a sequence; `truths` maps sensor folders to pose topics, truth first.
 
     `known` states whether the sequence is really of the data set, and not only in its format; `sensor` may be empty.

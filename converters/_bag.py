@@ -79,7 +79,7 @@ def recording_of(
 
 
 def recording(
-    sequence: Sequence, *, dataset: str, sensor: str, known: bool, truths: tuple[str, ...], images: bool = True
+    sequence: Sequence, *, dataset: str, sensor: str, known: bool, truths: tuple[str, ...], images: bool
 ) -> Recording:
     """Recording of a bag; the first topic of `truths` is the truth, then alphabetically.
 

@@ -110,7 +110,7 @@ def _sequences_in(folder: Path) -> list[Sequence]:
     return [Sequence(folder.name if len(found) == 1 else name, *place) for name, place in places.items()]
 
 
-def load_split(folder: Path, recording: str = "") -> Columns:
+def load_split(folder: Path, recording: str) -> Columns:
     """Columns of a recording's tables, each in the group of its sensor or of its file's name.
 
     Raises:

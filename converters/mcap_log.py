@@ -37,7 +37,7 @@ def sequences(source: Path) -> list[Sequence]:
     if source.is_dir():
         split = find_folders(source, lambda folder: bool(parts(Sequence(folder.name, folder))))
         taken = [sequence.path for sequence in split]
-        alone = (log for log in _logs(source) if log.path.parent not in taken and not _is_of_bag(log.path.parent))
+        alone = (log for log in _logs(source) if log.path.parent not in taken and not is_bag_folder(log.path.parent))
         return split + [log for log in alone if not _is_ours(log.path)]
     return [Sequence(name(source), source)] if source.is_file() and head(source, len(MAGIC)) == MAGIC else []
 
@@ -129,7 +129,7 @@ def parts(sequence: Sequence) -> list[Path]:
     A recorder numbers its parts from 0, and each begins where the one before it ends.
     """
     folder = sequence.path
-    if _is_of_bag(folder):
+    if is_bag_folder(folder):
         return []
     files = [path for path in with_suffix(folder, ".mcap") if path.is_file() and path.stat().st_size]
     named = {int(match[2]): (match[1], path) for path in files if (match := re.fullmatch(PART, path.stem))}
@@ -142,8 +142,8 @@ def parts(sequence: Sequence) -> list[Path]:
     return found if all(abs(gap) < MOST_PAUSE_NS for gap in gaps) else []
 
 
-def _is_of_bag(folder: Path) -> bool:
-    """Whether the logs in a folder are those of a ROS 2 bag."""
+def is_bag_folder(folder: Path) -> bool:
+    """Whether a folder is a ROS 2 bag; a recorder that died leaves no or empty metadata."""
     return b"rosbag2_bagfile_information" in head(folder / METADATA)
 
 
@@ -190,9 +190,7 @@ def _ends_whole(file: BinaryIO) -> bool:
     return end == MAGIC
 
 
-def read_parts(
-    sequence: Sequence, paths: list[Path], remarks: Remarks, *, images: bool = True, define: Define = as_defined
-) -> MessageLog:
+def read_parts(sequence: Sequence, paths: list[Path], remarks: Remarks, *, images: bool, define: Define) -> MessageLog:
     """Message log of the parts of a ROS 2 bag, one after the other.
 
     An unfinished one is read up to its end.

@@ -24,9 +24,9 @@ from imutool.recording.message_log import Message, MessageLog, MessageTopic, Rem
 from . import Sequence, mcap_log
 from ._ros_types import definition_from_files, need_rosbags, plain_cdr, ros2_definition
 from ._source import find_files, find_folders, head, with_suffix
+from .mcap_log import METADATA, is_bag_folder
 
 GENERAL = True
-METADATA = "metadata.yaml"
 SQLITE = b"SQLite format 3\0"
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 LISTED = re.compile(r"relative_file_paths:\s*\n((?:\s*- .*\n)+)")
@@ -51,7 +51,7 @@ def recognises(sequence: Sequence) -> bool:
 def parts(sequence: Sequence) -> list[Path]:
     """Storage files of a bag's folder: those that its metadata.yaml names, if all are there."""
     path = sequence.path
-    named = [path / name for name in _named(path)] if path.is_dir() and _has_metadata(path) else []
+    named = [path / name for name in _named(path)] if path.is_dir() and is_bag_folder(path) else []
     return named if named and all(file.is_file() for file in named) else with_suffix(path, ".mcap")
 
 
@@ -87,7 +87,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
 
 def _mcap_files(path: Path) -> list[Path]:
     """Storage files of a bag with metadata.yaml, in order, where all are finished MCAP logs."""
-    if not (path.is_dir() and _has_metadata(path)):
+    if not (path.is_dir() and is_bag_folder(path)):
         return []
     files = [path / name for name in _named(path)]
     if not all(file.is_file() for file in files):
@@ -120,12 +120,7 @@ def read(source: Path) -> Iterator[MessageLog]:
 
 
 def _is_bag(folder: Path) -> bool:
-    return _has_metadata(folder) or any(_has_messages(path) for path in with_suffix(folder, ".db3"))
-
-
-def _has_metadata(folder: Path) -> bool:
-    """Whether a folder's metadata.yaml is that of a bag; a recorder that died leaves none, or an empty one."""
-    return b"rosbag2_bagfile_information" in head(folder / METADATA)
+    return is_bag_folder(folder) or any(_has_messages(path) for path in with_suffix(folder, ".db3"))
 
 
 def _has_messages(path: Path) -> bool:
@@ -227,12 +222,12 @@ def _open(path: Path, remarks: Remarks) -> Iterator[list[Any]]:
     readers: list[Any]
     if path.is_file():
         readers = [Sqlite3Reader(path)]
-    elif _has_metadata(path) and not _misleads(path, remarks):
+    elif is_bag_folder(path) and not _misleads(path, remarks):
         readers = [DirectoryReader(path)]
     else:
         readers = [Sqlite3Reader(file) for file in sorted(with_suffix(path, ".db3"), key=_first_ns) if _has_messages(file)]
         readers = readers or [McapReader(file) for file in with_suffix(path, ".mcap")]
-        if not _has_metadata(path):
+        if not is_bag_folder(path):
             remarks.notes.append(f"the bag has no {METADATA}; its storage files were read in order of their first messages")
     for log in path.glob("*.db3-wal") if path.is_dir() else path.parent.glob(f"{path.name}-wal"):
         if log.stat().st_size:

@@ -98,9 +98,7 @@ class UsageError(ConfigError):
     exit_code = 2
 
 
-def not_installed(
-    package: str, extra: str, *, where: object = None, user: str = "", error: ImportError | None = None
-) -> ConfigError:
+def not_installed(package: str, extra: str, *, where: object, user: str = "", error: ImportError | None = None) -> ConfigError:
     """Error of a missing package, with the extra that brings it.
 
     `user` is what needs the package, `error` why an installed one cannot be imported.

@@ -26,6 +26,7 @@ from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids, parse_aids
+from imutool.inertial.metrics import Figures
 from imutool.inertial.scoring.path_blocks import PathBlocks, TrueSpan, in_memory, integrated, pieces
 from imutool.inertial.scoring.pose_delay import pose_delay
 from imutool.inertial.strapdown import StartPose, drift_windows, gaps_crossed, window_drift, with_velocity
@@ -43,10 +44,8 @@ DELAY_WINDOW_S = 1.0  # of the windows that show a delay of the poses
 CLEAR_STDS, MOST_DRIFT_LEFT = 4.0, 0.9  # of a clear delay: deviations, and share of the drift that is left without it
 DRIFTS = "drift_orientation_deg", "drift_velocity_m_s", "drift_orientation_std_deg", "drift_velocity_std_m_s"
 DELAY = "pose_delay_s", "pose_delay_std_s", "aoe_without_delay_deg", "drift_orientation_without_delay_deg"
-DEG = 180.0 / np.pi
 PURE, AIDED = "integration", "aided"
 Refused = Callable[[str, ImutoolError], None]
-Figures = dict[str, float | None]
 
 
 def evaluate(
@@ -200,7 +199,8 @@ def _drift(
         for name, column in zip(DRIFTS, np.concatenate(squares, axis=1), strict=False):  # without a model two
             is_angle = name.endswith("deg")
             if is_angle or has_positions:
-                out[name] = float(np.sqrt(column.mean())) * (DEG if is_angle else 1.0)
+                rms = np.sqrt(column.mean())
+                out[name] = float(np.rad2deg(rms) if is_angle else rms)
     return out
 
 
@@ -224,7 +224,7 @@ def _without_delay(imu: Imu, span: TrueSpan, recording: Recording, drift_deg: fl
 
 
 def _corrected(
-    imu: Imu, model: BiasModel | None, start: InitialBias | None, *, with_std: bool = False
+    imu: Imu, model: BiasModel | None, start: InitialBias | None, *, with_std: bool
 ) -> tuple[Imu, Float64[np.ndarray, "n 6"] | None]:
     """Samples corrected by a model, on request with the deviation of its bias; without one as they are."""
     if model is None or start is None:

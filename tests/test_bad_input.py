@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import gzip
-import hashlib
 import json
 import lzma
 import os
@@ -24,6 +23,7 @@ import numpy as np
 import pytest
 import zstandard
 from mcap_ros2.writer import Writer
+from support.digests import digests
 
 from fuzz import bounded
 from fuzz.numbers import put_log
@@ -47,12 +47,6 @@ TRIES = 20  # the middle may pass between two looks
 QUICK_S = 13.0  # of the flight that is trained on
 QUICK_SETTINGS = ("steps=40", "model.loads=[]", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]")
 QUICK = ["--method", "neural_ode", *(word for setting in QUICK_SETTINGS for word in ("--set", setting))]
-
-
-def digests(folder: Path) -> dict[str, str]:
-    """Every file below a folder, by its content."""
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def told(done: subprocess.CompletedProcess[str] | subprocess.Popen[str], stderr: str, code: int) -> str:

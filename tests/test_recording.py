@@ -32,15 +32,15 @@ def unit(rng: np.random.Generator, n: int) -> np.ndarray:
     return q / np.linalg.norm(q, axis=1)[:, None]
 
 
-def make_imu(n: int = 20, start_ns: int = EPOCH_NS, seed: int = 0) -> Imu:
+def make_imu(n: int = 20, seed: int = 0) -> Imu:
     rng = np.random.default_rng(seed)
-    return Imu(start_ns + 5_000_000 * np.arange(n), rng.normal(size=(n, 3)), rng.normal(size=(n, 3)))
+    return Imu(EPOCH_NS + 5_000_000 * np.arange(n), rng.normal(size=(n, 3)), rng.normal(size=(n, 3)))
 
 
-def make_poses(n: int = 20, *, moving: bool = True, period_ns: int = 10_000_000) -> Poses:
+def make_poses(n: int = 20, *, moving: bool = True) -> Poses:
     rng = np.random.default_rng(1)
     v_w = rng.normal(size=(n, 3)) if moving else None
-    return Poses(EPOCH_NS + period_ns * np.arange(n), rng.normal(size=(n, 3)), unit(rng, n), v_w)
+    return Poses(EPOCH_NS + 10_000_000 * np.arange(n), rng.normal(size=(n, 3)), unit(rng, n), v_w)
 
 
 def make_recording() -> Recording:

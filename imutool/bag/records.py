@@ -195,7 +195,7 @@ def chunk_info_of(found: Head, data: bytes) -> ChunkInfo:
     return ChunkInfo(found.number(b"chunk_pos"), first_ns, dict(struct.iter_unpack("<II", data[: len(data) // 8 * 8])))
 
 
-def unpack(compression: str, packed: bytes, size: int, *, cut: bool = False) -> bytes:
+def unpack(compression: str, packed: bytes, size: int, *, cut: bool) -> bytes:
     """Contents of a chunk, at most as long as stated; of a cut one the bytes it has.
 
     Raises:

@@ -250,7 +250,7 @@ def _first_minute(log: Log, topic: str, init: str, survey: Survey | None) -> Rec
     return Recording(log_name(log.path), samples, imu_topic=topic, source=str(log.path))
 
 
-def _samples(log: Log, topic: str, survey: Survey | None, end_ns: int | None = None) -> Imu:
+def _samples(log: Log, topic: str, survey: Survey | None, end_ns: int | None) -> Imu:
     """Samples of one IMU; with a survey they are cleaned, and `end_ns` refers to stamps.
 
     Raises:

@@ -268,7 +268,7 @@ FORMS: Mapping[str, tuple[str, str, float, str, str, Term]] = {
 }
 
 
-def unknown(rng: Generator, form: str | None = None) -> tuple[Model, Theta]:
+def unknown(rng: Generator, form: str | None) -> tuple[Model, Theta]:
     """Odd term of the signals on one column, at the plausible size."""
     name = form or sorted(FORMS)[rng.integers(len(FORMS))]
     _, output, large, unit, equation, term = FORMS[name]

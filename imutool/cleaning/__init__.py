@@ -68,7 +68,7 @@ def rows(batch: ImuBatch, index: slice | Bool[np.ndarray, " n"]) -> ImuBatch:
     return batch._replace(**{name: getattr(batch, name)[index] for name in batch._fields if name != "frame_id"})
 
 
-def cleaned(log: Log, survey: Survey, end_ns: int | None = None) -> Iterator[ImuBatch]:
+def cleaned(log: Log, survey: Survey, end_ns: int | None) -> Iterator[ImuBatch]:
     """Clean messages of a surveyed IMU, up to and including the stamp `end_ns`.
 
     Raises:

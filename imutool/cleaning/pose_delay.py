@@ -125,7 +125,7 @@ def _searched(slow: _Turns, fast: _Turns, longest_s: float, count: int, start_ns
     """Delay by turns over a second, refined by turns between neighbouring poses, in `count` parts."""
     coarse = np.arange(-longest_s, longest_s + 1e-9, STEP_S)
     slowly = slow.correlations(coarse, count)
-    if count == DELAY_PARTS and (stepped := _stepped(slow, fast, coarse, slowly, start_ns)) is not None:
+    if count == DELAY_PARTS and (stepped := _stepped(fast, coarse, slowly, start_ns)) is not None:
         return stepped
     whole = slowly[:, 0]
     at = _best(coarse, whole)
@@ -163,7 +163,7 @@ def _scatter(parts: Float64[np.ndarray, " p"]) -> float:
 
 
 def _stepped(
-    slow: _Turns, fast: _Turns, coarse: Float64[np.ndarray, " l"], slowly: Float64[np.ndarray, "l p"], start_ns: int
+    fast: _Turns, coarse: Float64[np.ndarray, " l"], slowly: Float64[np.ndarray, "l p"], start_ns: int
 ) -> Delay | None:
     """Delay of the larger side of a step, which parts show whose own delays are alike on each side of it alone."""
     best = [_best(coarse, column) for column in slowly.T]

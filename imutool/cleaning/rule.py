@@ -56,7 +56,7 @@ def every() -> tuple[str, ...]:
     return tuple(registry.names(GROUP))
 
 
-def chosen(only: Iterable[str], without: Iterable[str], force: bool = False, fix: bool = False) -> CleaningSettings:
+def chosen(only: Iterable[str], without: Iterable[str], force: bool, fix: bool) -> CleaningSettings:
     """Settings for the rules of a command line.
 
     Raises:

@@ -19,7 +19,6 @@ from imutool.errors import LogError
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
-from imutool.mcap_io.codec.formats import Path as Field
 from imutool.mcap_io.codec.reflection import Sample
 from imutool.mcap_io.codec.ros2_definition import DescribedCdr, parse
 from imutool.recording.message_log import MessageTopic, named_kind
@@ -34,10 +33,6 @@ Q_FRD_FROM_FLU_WXYZ = np.array([[0.0, 1.0, 0.0, 0.0]])
 US, BODY, WORLD = 1000, "base_link", "map"  # ns; frames of ROS
 KNOWN_FRAMES = 1, 2  # of VehicleOdometry's poses: NED, and FRD with any heading
 NUMBERS = 7  # of a pose: position, then xyzw
-
-
-def _row(name: str, count: int = 3) -> tuple[Field, ...]:
-    return tuple((name, place) for place in range(count))
 
 
 @dataclass(frozen=True)
@@ -67,7 +62,7 @@ class Px4:
             return int(at(message, (name,)))
 
         def vector(name: str, count: int = 3) -> Float64[np.ndarray, " k"]:
-            return np.array([at(message, field) for field in _row(name, count)], np.float64)
+            return np.array([at(message, (name, place)) for place in range(count)], np.float64)
 
         if self.kind in SINGLE_SENSORS:
             values = FLU_FROM_FRD * [float(at(message, (axis,))) for axis in "xyz"]

@@ -193,7 +193,7 @@ def _with_other_imus(
     return replace(diagnosis, imus=imus, remarks=(*diagnosis.remarks, *remarks))
 
 
-def read_log(log: Location, *, imu: str | None = None, truth: str | None = None) -> Recording:
+def read_log(log: Location, *, imu: str | None, truth: str | None = None) -> Recording:
     """A recording, which may fall freely, without samples that no sensor gives."""
     return measured_recording(longest_stretch(read(log, imu=imu, truth=truth)), free_fall=True)
 

@@ -221,7 +221,7 @@ def _pole(c: Float64[np.ndarray, " l"], rate_hz: float, near_hz: float) -> tuple
 # ── a second simulation ──
 
 
-def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile, clock: Chosen = ()) -> Mapping[str, Closer]:
+def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile, clock: Chosen) -> Mapping[str, Closer]:
     """Gain of a second simulation with some physics by signal, on held-out time.
 
     `clock` is the offset that is in every fit where the clocks share no epoch.

@@ -25,7 +25,7 @@ from imutool.errors import ConfigError, LogError, redact, required
 from imutool.fleet.one_log import work
 from imutool.fleet.task import Result, Task, failed
 from imutool.processes import system
-from imutool.processes.worker_pool import ONE_THREAD, WorkerBugError, WorkerPool
+from imutool.processes.worker_pool import ONE_THREAD, Tick, WorkerBugError, WorkerPool
 
 AHEAD = 2  # tasks in flight for each that can be worked on: the next one is there when one ends
 POLL_S = 0.5
@@ -33,7 +33,6 @@ ANSWER_S = 5.0
 BUG = 1
 SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))  # an empty SETTINGS frame of HTTP/2, the first that either side sends
 GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + SETTINGS  # RFC 9113, section 3.4; gRPC is HTTP/2
-Tick = Callable[[int], None]
 _decode = msgspec.json.Decoder(Task).decode
 _decode_result = msgspec.json.Decoder(Result).decode
 

@@ -36,13 +36,13 @@ from msgspec import Meta
 
 from imutool.array_types import Float64
 from imutool.config import Settings
+from imutool.inertial.kinematics import G_W
 from imutool.inertial.preintegration import EYE, SMALL_RAD2, Increment, Matrix3, Vector3, exp_and_jacobian, hat, log, matvec
 from imutool.recording import GRAVITY_M_S2
 
 TURN, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 POSE, BIAS, GROUND, STEADY = slice(0, 9), slice(9, 15), slice(15, 21), slice(21, 27)
 SIZE = 27
-G_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
 HAT_G, ONES = hat(G_W), np.ones(3)
 STOPPED = np.zeros((3, SIZE))  # rows of d(velocity)/d(error)
 STOPPED[:, VELOCITY] = np.eye(3)

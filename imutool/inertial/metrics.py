@@ -58,9 +58,9 @@ def evaluate_blocks(blocks: PathBlocks, distances_m: Sequence[float] = DISTANCES
     for estimate, truth in map(PathBlock.scored, blocks()):
         sums.add(estimate, truth)
         pairs.add(estimate, truth)
-    figures = _finite(sums.figures(blocks))
+    figures = _finite(sums.figures(blocks))  # a path that diverged has no finite APE, whatever its relative errors
     duration_s = float(sums.last_ns - sums.first_ns) * 1e-9
-    return {"samples": sums.count, "duration_s": duration_s, **figures, **_finite_pairs(pairs)}
+    return {"samples": sums.count, "duration_s": duration_s, **figures, **pairs.figures()}
 
 
 def absolute(estimate: Poses, truth: Poses, valid: Mask) -> Figures:
@@ -82,21 +82,6 @@ def absolute_blocks(blocks: PathBlocks) -> Figures:
     for estimate, truth in map(PathBlock.scored, blocks()):
         sums.add(estimate, truth)
     return _finite(sums.figures(blocks))
-
-
-def relative(estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[float] = DISTANCES_M) -> dict[str, Figures]:
-    """Relative errors `roe_deg` and `rpe_m`, keyed by the distance in metres ("5").
-
-    None if the true path is too short.
-
-    Raises:
-        DataError: stamps differ, or no row is valid.
-        NumericsError: a figure is not finite.
-    """
-    pairs = RelativeErrors(distances_m)
-    for block in _blocks_of(estimate, truth, valid)():
-        pairs.add(*block.scored())
-    return _finite_pairs(pairs)
 
 
 def write_tum(parts: Iterable[Poses], path: Path, overwrite: bool = False) -> None:
@@ -136,13 +121,6 @@ def _blocks_of(estimate: Poses, truth: Poses, valid: Mask) -> PathBlocks:
             yield PathBlock(path.rows(rows), part, np.ones(len(part), bool))
 
     return blocks
-
-
-def _finite_pairs(pairs: RelativeErrors) -> dict[str, Figures]:
-    """Relative errors; NumericsError of one that is not finite."""
-    found = pairs.figures()
-    _finite({f"{name} {key}": value for name, by_distance in found.items() for key, value in by_distance.items()})
-    return found
 
 
 def _finite(figures: Figures) -> Figures:

@@ -62,7 +62,7 @@ def inspect(path: Location, *, check: bool = True, max_chunk: int | None = None)
         return describe(log, check=check)
 
 
-def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
+def describe(log: RecoveredLog, *, check: bool) -> LogInfo:
     """Reports the contents of a log that is open.
 
     Raises:

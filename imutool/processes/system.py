@@ -96,7 +96,7 @@ def can_fork() -> bool:
     return sys.platform == "linux"
 
 
-def fork(nicer: int = 0) -> int:
+def fork(nicer: int) -> int:
     """Copy this process: 0 in the copy, its number here.
 
     The copy is `nicer` by so much, and ends with this one.

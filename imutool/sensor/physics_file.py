@@ -56,7 +56,6 @@ from imutool.sensor.effects import gyro_scale, low_pass
 from imutool.sensor.physics_file_terms import DRIVEN, VARIABLES
 from imutool.units import SENSORS, Sensor, Three
 
-SCHEMA = "imutool.physics/1"
 OTHER = "# Of another signal than the IMU's: simulate and debias do not apply it."
 NotNegative = Annotated[float, Meta(ge=0.0)]
 ThreeStd = tuple[NotNegative, NotNegative, NotNegative]
@@ -169,13 +168,13 @@ def read(path: Path) -> PhysicsFile:
     return file
 
 
-def write(file: PhysicsFile, path: Path, *, overwrite: bool = False) -> None:
+def write(file: PhysicsFile, path: Path) -> None:
     """Write a physics.toml, which `read` gives back bit for bit.
 
     Raises:
-        ConfigError: the file exists (without `overwrite`), or cannot be written.
+        ConfigError: the file exists, or cannot be written.
     """
-    with Target(path, overwrite=overwrite) as target:
+    with Target(path) as target:
         target.write(to_toml(file).encode())
 
 

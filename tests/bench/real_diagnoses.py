@@ -193,9 +193,7 @@ def as_file(values: Mapping[str, float]) -> PhysicsFile:
     return PhysicsFile(effect=tuple(Entry(name=effect, parameters=row) for effect, row in entries.items()))
 
 
-def residual_to_truth(
-    real: Path, chosen: Chosen = (), *, imu: str | None = None, truth: str | None = None
-) -> dict[str, Closer]:
+def residual_to_truth(real: Path, chosen: Chosen = ()) -> dict[str, Closer]:
     """Residual of a whole recording against its own true poses, by signal, without and with effects.
 
     The best constant of its own is in both; compared is as far up in frequency as the poses are known.
@@ -204,7 +202,7 @@ def residual_to_truth(
         ConfigError, LogError, DataError: as `diagnose`.
     """
     settings = DiagnoseSettings()
-    aligned = align(read_log(real, imu=imu, truth=truth), None, truth, settings)
+    aligned = align(read_log(real, imu=None), None, None, settings)
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     candidates = candidates_for(pairs)
     logs = []

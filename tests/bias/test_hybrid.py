@@ -37,9 +37,9 @@ SAME = 1e-12  # two orders of the same sums
 FORGOTTEN = 1e-4  # exp(-10), and a little
 
 
-def theta_of(sensor: Sensor, names: tuple[str, ...], seed: int = 5) -> np.ndarray:
+def theta_of(sensor: Sensor, names: tuple[str, ...]) -> np.ndarray:
     plausible = np.concatenate([np.zeros(0), *(effect.plausible for effect in catalogue.trained(sensor, names))])
-    return plausible * np.random.default_rng(seed).normal(size=len(plausible))
+    return plausible * np.random.default_rng(5).normal(size=len(plausible))
 
 
 def model_of(build: MakeModel, names: dict[Sensor, tuple[str, ...]] | None = None, **settings: object) -> network.Network:

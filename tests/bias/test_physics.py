@@ -64,7 +64,7 @@ def entry(name: str, values: Mapping[str, float], std: float | None = None) -> E
 def written(
     path: Path, *entries: Entry, bias: Bias | None = BIAS, unknown: tuple[Curve, ...] = (), term: tuple[Term, ...] = ()
 ) -> Path:
-    physics_file.write(PhysicsFile(effect=entries, bias=bias, unknown=unknown, term=term), path, overwrite=True)
+    path.write_text(physics_file.to_toml(PhysicsFile(effect=entries, bias=bias, unknown=unknown, term=term)), "utf-8")
     return path
 
 

@@ -28,10 +28,10 @@ WHEELS = {"stops": "", "odometry": "/odom", "ground": ""}
 TURNED_RAD = np.radians(1.5)  # error of the mount that the path begins with
 
 
-def there_and_back(seed: int = 0) -> tuple[Imu, Poses]:
+def there_and_back() -> tuple[Imu, Poses]:
     """Still, a flight, the same flight backwards, still: the stop in the end is exact, and so is its truth."""
-    imu = flight(seed, SETTINGS).imu
-    poses = trajectory(seed, SETTINGS).poses(imu.t_ns)
+    imu = flight(0, SETTINGS).imu
+    poses = trajectory(0, SETTINGS).poses(imu.t_ns)
     assert poses.v_w is not None
     period = int(np.diff(imu.t_ns)[0])
     t_ns = imu.t_ns[0] + period * np.arange(2 * len(imu) - 1)

@@ -429,9 +429,9 @@ def test_stamps_in_batches_are_no_missing_samples(made: ImuBatch) -> None:
     )
 
 
-def turned_on_a_table(limit: float | None, seconds: float = 40.0) -> np.ndarray:
+def turned_on_a_table(limit: float | None) -> np.ndarray:
     """Rates of an axis that rests, and then turns at a constant rate again and again, clipped before a drifting calibration."""
-    t = np.arange(round(seconds * 100.0)) / 100.0
+    t = np.arange(4000) / 100.0
     rate = 8.0 * np.clip(3.0 * np.sin(0.9 * (t - 10.0)), -1.0, 1.0) * (t > 10.0)
     rate += np.random.default_rng(3).normal(0.0, 0.005, len(t))
     return (rate if limit is None else np.clip(rate, -limit, limit)) * (1.0 + 2e-6 * t)

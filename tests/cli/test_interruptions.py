@@ -7,7 +7,6 @@ that could still act; what KILL leaves, the next run on that target removes.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import itertools
 import os
 import re
@@ -23,6 +22,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+from support.digests import digests
 from support.forked import Forked
 from support.processes import soon
 
@@ -95,11 +95,6 @@ def brief(here: Path, name: str) -> Path:
     (here / "in.mcap").unlink()
     write(flight(1, duration_s=26.0 if name == "conceal" else BRIEF_S, rate_hz=100.0), here / "in.mcap")
     return here
-
-
-def digests(folder: Path) -> dict[str, str]:
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def partials(folder: Path) -> list[str]:

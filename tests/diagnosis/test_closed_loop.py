@@ -128,7 +128,7 @@ def test_a_jump_of_the_clock_comes_at_its_time_in_a_simulation_that_begins_later
     physics_file.write(file, physics)
     assert physics_file.read(physics) == file
     for start_ns, right in ((file.start_ns, True), (None, False)):  # else times count from its own first sample, and come late
-        physics_file.write(msgspec.structs.replace(file, start_ns=start_ns), physics, overwrite=True)
+        physics.write_text(physics_file.to_toml(msgspec.structs.replace(file, start_ns=start_ns)), "utf-8")
         simulate(sim, closed, physics=physics, overwrite=True)
         made, since_s = read(closed).imu, seconds(real.imu.t_ns, int(real.imu.t_ns[0]))
         rows = (since_s > 20.1) & (since_s < 20.0 + LATE_S)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import signal
@@ -23,6 +22,7 @@ from mcap.writer import Writer
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
+from support.digests import digests
 from support.loaded import loaded_by_command
 
 from imutool.api.logs import export
@@ -33,6 +33,7 @@ from imutool.errors import ConfigError, ImutoolError, LogError
 from imutool.exporting import log_parts
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
+from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars
@@ -95,14 +96,6 @@ def test_the_true_bias_of_a_debiased_imu_is_what_debias_left(log: Path, tmp_path
 def _exported(log: Path, out: Path) -> Path:
     export(log, out, format="euroc")
     return out
-
-
-def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def everything(folder: Path) -> dict[str, str]:
-    return {str(p.relative_to(folder)): digest(p) for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def back(folder: Path) -> Recording:
@@ -227,10 +220,6 @@ def test_a_truth_without_velocity_comes_back_without(tmp_path: Path) -> None:
     assert dict(again.scalars) == {}
 
 
-def files(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
 def alike_in_parts(log: Path, monkeypatch: pytest.MonkeyPatch, parts: int) -> bool:
     """Whether a log exported in parts gives the same files and report; it takes at least so many parts."""
     whole = export(log, log.parent / "whole", format="euroc")
@@ -246,7 +235,7 @@ def alike_in_parts(log: Path, monkeypatch: pytest.MonkeyPatch, parts: int) -> bo
     found = export(log, log.parent / "parts", format="euroc")
     assert len(taken) >= parts
     same = found.written == whole.written and set(found.left_out) == set(whole.left_out)
-    return same and files(log.parent / "parts") == files(log.parent / "whole")
+    return same and digests(log.parent / "parts") == digests(log.parent / "whole")
 
 
 def test_a_log_in_parts_gives_the_same_folder(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -320,10 +309,10 @@ def test_a_camera_without_a_number_takes_no_other_s_folder(tmp_path: Path) -> No
 
 
 def test_a_rosbag2_folder_holds_the_log_byte_for_byte(log: Path, tmp_path: Path) -> None:
-    before = digest(log)
+    before = sha256(log)
     export(log, tmp_path / "bag", format="rosbag2")
     assert sorted(p.name for p in (tmp_path / "bag").iterdir()) == ["bag_0.mcap", "metadata.yaml"]
-    assert digest(tmp_path / "bag/bag_0.mcap") == digest(log) == before
+    assert sha256(tmp_path / "bag/bag_0.mcap") == sha256(log) == before
     assert (tmp_path / "bag/bag_0.mcap").stat().st_ino != log.stat().st_ino  # a copy, no link
 
 
@@ -405,13 +394,13 @@ def test_a_log_that_is_no_ros2_log_cannot_be_copied_into_a_bag(log: Path, tmp_pa
 def test_what_is_there_is_replaced_only_when_asked(log: Path, tmp_path: Path, format: str) -> None:
     out = tmp_path / "out"
     export(log, out, format=format)
-    first = everything(out)
+    first = digests(out)
     with pytest.raises(ConfigError, match="`overwrite=True`"):
         export(log, out, format=format)
-    assert everything(out) == first
+    assert digests(out) == first
     write(whole(3.0), tmp_path / "longer.mcap")
     export(tmp_path / "longer.mcap", out, format=format, overwrite=True)
-    assert everything(out) != first
+    assert digests(out) != first
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
 
 
@@ -423,10 +412,10 @@ def test_a_folder_that_was_not_made_here_is_never_removed(log: Path, tmp_path: P
     signed = original / ("metadata.yaml" if format == "rosbag2" else "mav0/imu0/sensor.yaml")
     made = signed.read_text(encoding="utf-8")
     signed.write_text("sensor_type: imu\n", encoding="utf-8")
-    held = everything(original)
+    held = digests(original)
     with pytest.raises(ConfigError, match="not made by imutool"):
         export(log, original, format=format, overwrite=True)
-    assert everything(original) == held
+    assert digests(original) == held
     signed.write_text(made, encoding="utf-8")
     added = ("mav0/imu0/notes.txt", "mav0/cam7/data.csv") if format == "euroc" else ("walk_1.mcap",)
     for name in ("thesis.tex", *added):
@@ -443,7 +432,7 @@ def test_the_log_is_never_in_the_folder_that_is_replaced(log: Path, tmp_path: Pa
     export(log, tmp_path / "bag", format="rosbag2")
     with pytest.raises(ConfigError, match="would replace the source"):
         export(tmp_path / "bag/bag_0.mcap", tmp_path / "bag", format="rosbag2", overwrite=True)
-    assert digest(tmp_path / "bag/bag_0.mcap") == digest(log)
+    assert sha256(tmp_path / "bag/bag_0.mcap") == sha256(log)
 
 
 @pytest.mark.parametrize("format", ["euroc", "rosbag2"])
@@ -453,10 +442,10 @@ def test_nothing_is_left_after_a_failure(log: Path, tmp_path: Path, format: str,
         raise failure
 
     expected = KeyboardInterrupt if failure is KeyboardInterrupt else ConfigError
-    held = everything(tmp_path)
+    held = digests(tmp_path)
     with pytest.raises(expected):
         export(log, tmp_path / "out", format=format, progress=fail)
-    assert everything(tmp_path) == held
+    assert digests(tmp_path) == held
     assert sorted(p.name for p in tmp_path.iterdir()) == ["log.mcap"]
 
 

@@ -35,8 +35,8 @@ def made(seconds: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndar
     return t_ns, gyro, accel
 
 
-def in_seconds(imu: Imu, settings: StationarySettings | None = None) -> list[tuple[float, float]]:
-    return [(a / RATE_HZ, b / RATE_HZ) for a, b in rest_stretches(imu, settings)]
+def in_seconds(imu: Imu) -> list[tuple[float, float]]:
+    return [(a / RATE_HZ, b / RATE_HZ) for a, b in rest_stretches(imu)]
 
 
 def test_a_resting_log_is_one_stretch_in_nearly_its_whole_length():

@@ -73,8 +73,6 @@ def test_an_existing_file_is_kept(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="exists"):
         write(PhysicsFile(), path)
     assert path.read_text() == "mine"
-    write(PhysicsFile(), path, overwrite=True)
-    assert read(path) == PhysicsFile()
 
 
 LEVER = '[[effect]]\nname = "lever_arm"\nsignal = "accel"\n[effect.parameters.x]\nvalue = 0.1\nstd = 0.004\nunit = "m"\n'

@@ -19,10 +19,10 @@ from imutool.recording import Imu
 JITTER_NS = 200_000  # of the recorder's clock
 
 
-def batch_of(imu: Imu, delay_ns: int = 3_000_000) -> ImuBatch:
+def batch_of(imu: Imu) -> ImuBatch:
     """An IMU's samples as messages; the recorder gets them a little later, with some jitter."""
     n = len(imu)
-    log_ns = imu.t_ns + delay_ns + np.random.default_rng(7).integers(0, JITTER_NS, n)
+    log_ns = imu.t_ns + 3_000_000 + np.random.default_rng(7).integers(0, JITTER_NS, n)
     return ImuBatch(log_ns, log_ns, np.arange(n, dtype=np.uint32), imu.t_ns.copy(), imu.gyro.copy(), imu.accel.copy(), "imu0")
 
 

@@ -40,7 +40,7 @@ AT_BODY = Mount(np.zeros(3), Rotation.identity())
 
 
 def read_simulation(
-    sim: Location, *, imu: str | None = None, truth: str | None = None, simulated: bool = True
+    sim: Location, *, imu: str | None, truth: str | None = None, simulated: bool = True
 ) -> tuple[Recording, Mount]:
     """A simulation with the poses of its sensor, and the mount that moved them.
 

@@ -15,13 +15,14 @@ from itertools import pairwise
 import numpy as np
 from scipy.signal import butter, csd, sosfiltfilt, welch
 
-from imutool.array_types import Bool, Float64, Int64
+from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, expected
 from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, Whitener, level, settled, whitener
 from imutool.diagnosis.settings import BandSettings
 from imutool.errors import DataError
+from imutool.noise.bias_walk import INDEPENDENT
 from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.effects import vibration
@@ -31,9 +32,7 @@ logger = logging.getLogger(__name__)
 RIDGE = 1e-8
 LEAST_ROWS = 2  # times the order of the noise model: rows that follow others without a gap
 ALL_SLOW, SLOW_ORDER = 0.9, 4  # of the frequencies, from which on nothing is fast; order of the filter
-INDEPENDENT = 1e-3  # of the largest singular value, below which a column is a combination of others
 Axes = Float64[np.ndarray, " _"]
-OnAxis = tuple[Int64[np.ndarray, " q"], Float64[np.ndarray, "q _"]]  # parameters that act on an axis, and their derivatives
 EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the bands in which the poses are checked
 
 

@@ -182,16 +182,12 @@ class WhitenedImu(WhitenedLog):
     pair: Pair
 
 
-def whitener(
-    residual: Float64[np.ndarray, "n k"], usable: Bool[np.ndarray, "n ..."], order: int, band: Band | None = None
-) -> Whitener:
+def whitener(residual: Float64[np.ndarray, "n k"], usable: Bool[np.ndarray, "n ..."], order: int) -> Whitener:
     """Whitening filters from a residual and its usable rows or samples.
 
     The size is robust (a few spikes are not the noise), but no less than half of what the plain one is.
     """
     filters, std = np.zeros((residual.shape[1], order + 1)), np.ones(residual.shape[1])
-    if band is not None:
-        residual, usable = band(residual), usable[:: band.every]
     filters[:, 0] = 1.0
     for axis, counts in enumerate(_by_axis(usable, residual.shape[1])):
         rows = settled(counts, order)
@@ -201,7 +197,7 @@ def whitener(
         white = lfilter(filters[axis], [1.0], residual[:, axis])[rows]
         robust = MAD_TO_STD * float(np.median(np.abs(white)))
         std[axis] = max(robust, 0.5 * float(np.sqrt(np.mean(white**2))), LEAST_STD)
-    return Whitener(filters, std, band)
+    return Whitener(filters, std)
 
 
 def level(

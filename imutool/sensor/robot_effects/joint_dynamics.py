@@ -15,8 +15,9 @@ from itertools import product
 import numpy as np
 
 from imutool.array_types import Float64, Int64
+from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.effect import Theta
-from imutool.sensor.robot_effects.planar_chain import GRAVITY_M_S2, chain_columns, mass_coefficients, unpacked
+from imutool.sensor.robot_effects.planar_chain import chain_columns, mass_coefficients, unpacked
 from imutool.sensor.robot_effects.signal_samples import Column, Columns, State
 from imutool.sensor.robot_effects.spatial_chain import Axes, SpatialChain, searched
 

@@ -11,9 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from imutool.array_types import Complex128, Float64
+from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.robot_effects.signal_samples import Column, State
-
-GRAVITY_M_S2 = 9.81
 
 
 def unpacked(

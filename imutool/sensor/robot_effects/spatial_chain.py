@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
-from imutool.sensor.robot_effects.planar_chain import GRAVITY_M_S2
+from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.robot_effects.signal_samples import State
 
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])  # of an axis where all angles are zero: most arms are built square

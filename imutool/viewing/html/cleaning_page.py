@@ -23,7 +23,7 @@ UNITS_OF_NAMES = {"s": "s", "hz": "Hz"}  # by the end of a value's name
 MIN_WIDTH = 0.002  # of the strip, so that one sample in an hour is visible
 
 
-def write(surveys: Sequence[Survey], path: Path, *, overwrite: bool = False) -> None:
+def write(surveys: Sequence[Survey], path: Path, *, overwrite: bool) -> None:
     """Write the page as one file without requests (ConfigError: a bad target)."""
     with Target(path, overwrite=overwrite) as target:
         target.write(html(surveys).encode())

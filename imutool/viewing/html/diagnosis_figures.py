@@ -5,7 +5,7 @@ Colours are variables of the page's style sheet, so that one drawing serves ligh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from scipy.signal import fftconvolve, welch
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Bool, Float64
+from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS
 from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.result import Curve, Diagnosis, Located, SignalTraces, Traces
 from imutool.diagnosis.wording.effect_sentences import signals
@@ -20,8 +21,6 @@ from imutool.units import AXES, UNITS
 from imutool.viewing.html.drawing import plain_tick_labels, svg
 from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, TITLES
 from imutool.viewing.model.decimation import DecimatedLine, Line, average_log_bins, decimate_extremes, true_intervals
-
-SIGNALS = {"gyro": slice(0, 3), "accel": slice(3, 6)}
 
 BUCKETS = 600  # of a line; each draws its lowest and its highest sample
 STRIP_BINS = 400
@@ -33,10 +32,10 @@ BLOCK_S = 0.5  # one independent value each: the misfit of a motion lasts about 
 GAP_PERIODS = 1.5  # sample periods without a sample that end a stretch
 
 
-def compared_signals(traces: Sequence[Traces]) -> dict[str, slice]:
+def compared_signals(traces: Sequence[Traces]) -> Mapping[str, slice]:
     """Columns of the signals that were compared: of the gyro alone if no position is known."""
     positions = any(trace.truth is None or trace.truth.has_positions for trace in traces)
-    return SIGNALS if positions else {"gyro": SIGNALS["gyro"]}
+    return IMU_SIGNALS if positions else {"gyro": IMU_SIGNALS["gyro"]}
 
 
 def misfit_strip(d: Diagnosis, trace: Traces) -> str:
@@ -49,7 +48,7 @@ def misfit_strip(d: Diagnosis, trace: Traces) -> str:
         heights = _local_rms(trace, edges)
         for row, name in enumerate(names):
             signal, axis = name.split()
-            top = np.nanmax(heights[:, SIGNALS[signal]], initial=0.0)
+            top = np.nanmax(heights[:, IMU_SIGNALS[signal]], initial=0.0)
             if top > 0.0:
                 area = np.nan_to_num(heights[:, row]) / top * 0.9
                 axes.fill_between(edges[:-1], -row, -row + area, step="post", color=INK, alpha=0.55, lw=0)
@@ -151,7 +150,7 @@ def residual_against_attitude(d: Diagnosis) -> str | None:
 
     if any(trace.truth is None for trace in d.traces):
         return None
-    return _binned(d, variable, dict.fromkeys(SIGNALS, "{} above the horizon (°)"), "attitude")
+    return _binned(d, variable, dict.fromkeys(IMU_SIGNALS, "{} above the horizon (°)"), "attitude")
 
 
 def curve(smooth: Curve, signal: str) -> str:

@@ -13,13 +13,13 @@ from imutool.array_types import Float64
 from imutool.inertial import stationary
 from imutool.noise import allan
 from imutool.recording import Imu
-from imutool.units import AXES, SENSORS, UNITS, Sensor
+from imutool.units import AXES, NOUNS, SENSORS, UNITS, Sensor
 from imutool.viewing.html.drawing import Panel, Picture, at_least_three_ticks, decades, legend, plain_tick_labels
 from imutool.viewing.html.page import AXIS_COLORS, INK, SOFT, TITLES
 from imutool.viewing.html.report_paths import color_of, style_of
 from imutool.viewing.html.report_wording import best_run, format_number, run_name, worst_orientation_error
 from imutool.viewing.model.decimation import average_log_bins, decimate_extremes
-from imutool.viewing.model.run_data import Run, RunData, Spectrum, Trace, round_up_125, spectra
+from imutool.viewing.model.run_data import RunData, Spectrum, Trace, round_up_125, spectra
 
 HEIGHT_INCH, SAMPLES_INCH = 4.2, 5.2
 TAIL = 0.005  # of the samples: spikes may cross into the next run
@@ -29,7 +29,6 @@ SIGMAS = 3.0
 ROUNDING = 1e-7  # of the largest density: below is the rounding of a difference that is constant
 BAND_POINTS = 300
 MIN_REST_S = 4.0  # in one piece, for an Allan deviation
-NOUNS = {"gyro": "Angular rate", "accel": "Specific force"}
 
 Vectors = Float64[np.ndarray, "_ 3"]
 Values = Float64[np.ndarray, " _"]
@@ -80,7 +79,8 @@ def spectrum(data: RunData) -> Picture | None:
     }
     if not any(curves.values()):
         return None
-    subtracted = [(trace, _subtracted(trace.run)) for trace in data.models()]
+    removed = ((trace, Imu(trace.run.imu.t_ns, trace.run.gyro_bias, trace.run.accel_bias)) for trace in data.models())
+    subtracted = [(trace, spectra(bias)) for trace, bias in removed]
     panels = [
         Panel(
             partial(_draw_spectrum, data=data, sensor=sensor, curves=curves[sensor], subtracted=subtracted),
@@ -93,11 +93,6 @@ def spectrum(data: RunData) -> Picture | None:
     caption = "Amplitude density of the samples (Welch), up to half their rate."
     caption += " Dashed: the difference, raw minus debiased; it is small where the curves coincide." * bool(subtracted)
     return Picture("spectrum", "Spectra", caption, tuple(panels))
-
-
-def _subtracted(run: Run) -> Mapping[str, Spectrum]:
-    """Spectra of raw minus debiased."""
-    return spectra(Imu(run.imu.t_ns, run.gyro_bias, run.accel_bias))
 
 
 def allan_deviation(data: RunData) -> Picture | None:

@@ -194,10 +194,6 @@ def windows(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> tuple[W
         of_length = drift_windows(path.t_ns, valid, length_s)
         found = [window_drift(part, true, *local.T) for part, true, local in pieces_in_memory(path, truth, of_length)]
         if found:
-            turned, *moved = (_rms(np.concatenate(column)) for column in zip(*found, strict=True))
+            turned, *moved = (float(np.sqrt(np.mean(np.concatenate(column) ** 2))) for column in zip(*found, strict=True))
             rows.append(Window(length_s, len(of_length), float(np.rad2deg(turned)), *(moved if known else [np.nan] * 2)))
     return tuple(rows)
-
-
-def _rms(values: Float64[np.ndarray, " n"]) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -14,7 +14,7 @@ from imutool.diagnosis.result import Diagnosis, Located, Traces
 from imutool.diagnosis.wording.conclusion import lines, location_text
 from imutool.mcap_io.storage.target import Target
 from imutool.recording import Times
-from imutool.units import AXES, SENSORS, UNITS
+from imutool.units import AXES, NOUNS, SENSORS, UNITS
 from imutool.viewing.html.diagnosis_figures import intervals_in_log
 from imutool.viewing.model.decimation import true_intervals
 from imutool.viewing.rerun import rr, rrb
@@ -23,7 +23,6 @@ from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, EVENT_COLOR, GREY,
 from imutool.viewing.rerun.plots import frame, whole_time_axis
 from imutool.viewing.rerun.sdk import elapsed_column, entity_path, new_stream, rrd_bytes, unique_names
 
-TITLES = {"gyro": "Angular rate", "accel": "Specific force"}
 CURVES = ("real", "before", "after")  # columns of `samples`; `left` holds real minus before and real minus after
 COLORS: tuple[Color, ...] = (GREY, RAW_COLOR, MODEL_COLORS[0])
 WIDTHS: tuple[float, ...] = (BOLD_WIDTH, RAW_WIDTH, RAW_WIDTH)
@@ -31,9 +30,9 @@ UNSEEN_COLOR: Color = (122, 122, 122)
 UNSEEN_TEXTS = ("unseen by any fit from here", "seen again from here")
 
 
-def save(d: Diagnosis, path: Path, *, overwrite: bool = False) -> None:
+def save(d: Diagnosis, path: Path) -> None:
     """Write the .rrd file (ConfigError: no Rerun, or the file exists or cannot be written)."""
-    with Target(path, overwrite=overwrite) as target:  # refuses before the work is done, leaves nothing after a failure
+    with Target(path) as target:  # refuses before the work is done, leaves nothing after a failure
         target.write(rrd(d))
 
 
@@ -92,7 +91,7 @@ def _log_tab(name: str, trace: Traces) -> rrb.Vertical:
     def view(kind: str, sensor: str, axis: str) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(
             origin=entity_path((name, sensor, axis), kind),
-            name=f"{TITLES[sensor]} {axis} ({UNITS[sensor]})",
+            name=f"{NOUNS[sensor]} {axis} ({UNITS[sensor]})",
             axis_x=whole_time_axis(span_s),
             plot_legend=rrb.Corner2D.LeftTop,
         )

@@ -35,7 +35,7 @@ def main() -> NoReturn:
     parser.add_argument("--recording-id")
     parser.add_argument("--entity-path-prefix", default="")
     given, _ = parser.parse_known_args()
-    if not _is_mcap(given.file):  # before anything heavy is imported
+    if first_bytes(given.file, len(MAGIC)) != MAGIC:  # before anything heavy is imported
         sys.exit(INCOMPATIBLE)
     from imutool.errors import ImutoolError
 
@@ -73,11 +73,6 @@ def rrd(path: Path, application: str | None = None, recording: str | None = None
         scene.log([data], stream, root=root)
 
     return sdk.rrd_bytes(sdk.new_stream(data.name, application=application, recording=recording), send)
-
-
-def _is_mcap(path: Path) -> bool:
-    """Whether a file begins like an MCAP log."""
-    return first_bytes(path, len(MAGIC)) == MAGIC
 
 
 def load_first_imu(path: Location, findings: Path | None = None) -> RunData | None:

@@ -32,7 +32,7 @@ def log(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True,
         _log_one(data, to, scope, source)
 
 
-def send(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True) -> None:
+def send(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool) -> None:
     """Send the layout, then log all entities (ConfigError: Rerun is not installed)."""
     to.send_blueprint(layout.blueprint(logs, source=source))
     log(logs, to, source=source)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from imutool.units import AXES, SENSORS, UNITS
+from imutool.units import AXES, NOUNS, SENSORS, UNITS
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift, Errors
 from imutool.viewing.rerun import other_topics, rr, rrb, sdk
@@ -16,7 +16,7 @@ from imutool.viewing.rerun.entities.styles import BACKGROUND, color_name, color_
 from imutool.viewing.rerun.plots import error_axis_limit, error_range, plot, whole_time_axis
 from imutool.viewing.rerun.sdk import Scope
 
-TITLES = {"gyro": "Angular rate (rad/s)", "accel": "Specific force (m/s²)"}
+TITLES = {sensor: f"{NOUNS[sensor]} ({UNITS[sensor]})" for sensor in SENSORS}
 BIAS_TITLES = {"gyro": "Gyro bias (rad/s)", "accel": "Accel bias (m/s²)"}
 SPECTRUM_TITLES = {
     "gyro": "Angular rate: root of density (rad/s/√Hz) over frequency",

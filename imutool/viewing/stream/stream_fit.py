@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 import threading
 from collections.abc import Sequence
@@ -24,8 +23,6 @@ from imutool.viewing.stream.samples import Sample
 STREAM = "the stream"  # in messages
 JUDGED_S = (10.0, 30.0, CHECKED_S)  # after which the samples are judged while the stream goes on
 SWITCH_S = 0.0005  # that another thread may keep the interpreter: Python's own 5 ms are the whole delay allowed
-
-logger = logging.getLogger("imutool")
 
 
 def imu_of(samples: Sequence[Sample]) -> Imu:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfilt
@@ -188,7 +190,7 @@ def test_a_band_keeps_every_so_many_th_sample_and_no_fewer_than_its_edge_needs()
 def test_white_noise_behind_a_band_becomes_white_again() -> None:
     band = Band.below(10.0, 200.0)
     x, everything = STD * white(10, 40_000), np.ones(40_000, bool)
-    w = whitener(x, everything, 12, band)
+    w = replace(whitener(band(x), everything[:: band.every], 12), band=band)
     out = w(x)[200:-200]
     assert w.every == band.every
     assert len(w(x)) == len(x[:: band.every])

@@ -296,13 +296,13 @@ def test_efforts_that_are_motor_currents_are_told() -> None:
     assert current_remark({"/j.effort[0]": 0.8}) == []
 
 
-def json_log(path: Path, messages: Sequence[dict[str, object]], topic: str = "/drone0/sensors") -> None:
+def json_log(path: Path, messages: Sequence[dict[str, object]]) -> None:
     """A log of one topic in JSON, stamped by its log times."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start("", "a fleet's own logger")
         schema = writer.register_schema("acme.Sensors", "jsonschema", b'{"type": "object"}')
-        channel = writer.register_channel(topic, "json", schema)
+        channel = writer.register_channel("/drone0/sensors", "json", schema)
         for t_s, message in zip(T, messages, strict=False):
             writer.add_message(channel, round(t_s * 1e9), json.dumps(message).encode(), round(t_s * 1e9))
         writer.finish()  # type: ignore[no-untyped-call]  # mcap has no annotation for it

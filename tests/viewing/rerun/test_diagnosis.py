@@ -5,57 +5,24 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 from support import diagnoses
 from support.diagnoses import replace
 from support.loaded import loaded
+from support.saved_rrd import Entity, read
 
 from imutool.diagnosis.wording.conclusion import headline
 from imutool.errors import ConfigError
 from imutool.viewing.rerun import diagnosis as view
 from imutool.viewing.rerun.viewer import binary
 
+SCALARS, STATE, TEXT = "Scalars:scalars", "StateChange:state", "TextLog:text"
 AXES = [(signal, axis) for signal in ("gyro", "accel") for axis in "xyz"]
-
-
-@dataclass
-class Entity:
-    """All that a file says of one entity, temporal columns in the order of their rows."""
-
-    static: dict[str, Any] = field(default_factory=dict)
-    columns: dict[str, pa.Array] = field(default_factory=dict)
-
-    def numbers(self) -> np.ndarray:
-        values = self.columns["Scalars:scalars"]
-        return values.flatten().to_numpy(zero_copy_only=False).reshape(len(values), -1)
-
-    def elapsed_ns(self) -> np.ndarray:
-        times: np.ndarray = self.columns["elapsed"].cast(pa.int64()).to_numpy()
-        return times
-
-
-def read(path: Path) -> dict[str, Entity]:
-    reader = RrdReader(path)
-    (store,) = reader.recordings()
-    entities: dict[str, Entity] = {}
-    for chunk in reader.stream(store=store):
-        entity = entities.setdefault(chunk.entity_path, Entity())
-        batch = chunk.to_record_batch()
-        for name, column in zip(batch.schema.names, batch.columns, strict=True):
-            if chunk.is_static:
-                entity.static[name] = column.to_pylist()[0]
-            else:
-                before = entity.columns.get(name)
-                entity.columns[name] = column if before is None else pa.concat_arrays([before, column])
-    return entities
 
 
 def layout(path: Path) -> str:
@@ -81,10 +48,10 @@ def test_samples_and_what_is_left_read_back_bit_for_bit_with_their_nanoseconds(f
         for column, (signal, axis) in enumerate(AXES):
             real, before, after = (values[:, column] for values in (trace.real, trace.before, trace.after))
             samples, left = (entities[f"{root}/{signal}/{axis}/{kind}"] for kind in ("samples", "left"))
-            np.testing.assert_array_equal(samples.numbers(), np.stack([real, before, after], axis=1))
-            np.testing.assert_array_equal(left.numbers(), np.stack([real - before, real - after], axis=1))
+            np.testing.assert_array_equal(samples.numbers(SCALARS), np.stack([real, before, after], axis=1))
+            np.testing.assert_array_equal(left.numbers(SCALARS), np.stack([real - before, real - after], axis=1))
             for entity in (samples, left):
-                np.testing.assert_array_equal(entity.elapsed_ns(), np.rint(trace.t_s * 1e9).astype(np.int64))
+                np.testing.assert_array_equal(entity.times(SCALARS, "elapsed"), np.rint(trace.t_s * 1e9).astype(np.int64))
             assert samples.static["SeriesLines:names"] == ["real", "before", "after"]
             assert left.static["SeriesLines:names"] == ["before", "after"]
             assert samples.static["SeriesLines:colors"][1:] == left.static["SeriesLines:colors"]
@@ -100,8 +67,8 @@ def test_the_file_holds_exactly_the_entities_it_should(folder: Path) -> None:
 
 def states(entity: Entity) -> list[tuple[float, str]]:
     """Times in seconds, and what begins there."""
-    told = [state[0] for state in entity.columns["StateChange:state"].to_pylist()]
-    return list(zip((entity.elapsed_ns() * 1e-9).round(6).tolist(), told, strict=True))
+    told = [state[0] for state in entity.rows(STATE).to_pylist()]
+    return list(zip((entity.times(STATE, "elapsed") * 1e-9).round(6).tolist(), told, strict=True))
 
 
 def test_a_state_turns_where_a_located_stretch_begins_and_ends(folder: Path) -> None:
@@ -128,7 +95,7 @@ def test_lines_show_the_extremes_of_what_falls_on_a_pixel(folder: Path) -> None:
 
 def test_events_stand_where_stretches_begin_and_end(folder: Path) -> None:
     events = read(folder / "BOTH.rrd")["/flight/events"]
-    told = list(zip(events.elapsed_ns() * 1e-9, [t[0] for t in events.columns["TextLog:text"].to_pylist()], strict=True))
+    told = list(zip(events.times(TEXT, "elapsed") * 1e-9, [t[0] for t in events.rows(TEXT).to_pylist()], strict=True))
     assert [t for t, _ in told] == sorted(t for t, _ in told)
     at = {(round(t, 1), text) for t, text in told}
     turning, fast = "gyro x, y, z, when turning", "accel x, y, angular rate above 0.4 rad/s"
@@ -184,8 +151,8 @@ def test_two_logs_of_one_name_stay_apart(folder: Path) -> None:
     assert view.names(d.traces) == ["log", "log (2)", "report (2)"]
     view.save(d, folder / "twice.rrd")
     entities = read(folder / "twice.rrd")
-    np.testing.assert_array_equal(entities["/log/gyro/x/samples"].numbers()[:, 0], first.real[:, 0])
-    np.testing.assert_array_equal(entities[r"/log\ \(2\)/gyro/x/samples"].numbers()[:, 0], second.real[:, 0])
+    np.testing.assert_array_equal(entities["/log/gyro/x/samples"].numbers(SCALARS)[:, 0], first.real[:, 0])
+    np.testing.assert_array_equal(entities[r"/log\ \(2\)/gyro/x/samples"].numbers(SCALARS)[:, 0], second.real[:, 0])
 
 
 @pytest.mark.parametrize("name", ["NOTHING", "BOTH", "THREE"])
@@ -196,14 +163,12 @@ def test_reruns_own_verifier_accepts_the_file(folder: Path, name: str) -> None:
     assert run.returncode == 0, run.stderr
 
 
-def test_an_existing_file_is_kept_unless_told_otherwise(tmp_path: Path) -> None:
+def test_an_existing_file_is_kept(tmp_path: Path) -> None:
     target = tmp_path / "view.rrd"
     target.write_bytes(b"mine")
     with pytest.raises(ConfigError, match="exists"):
         view.save(diagnoses.NOTHING, target)
     assert target.read_bytes() == b"mine"
-    view.save(diagnoses.NOTHING, target, overwrite=True)
-    assert "/report" in read(target)
     assert [path.name for path in tmp_path.iterdir()] == ["view.rrd"]
 
 
