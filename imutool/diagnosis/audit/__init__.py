@@ -160,7 +160,8 @@ def lines(report: AuditReport) -> list[str]:
         out.append(f"    {fault.equation}; reported in {fault.source}")
         out += [f"    No fault if {fault.unless}."] if fault.unless else []
     for sensor, share in report.unexplained.items():
-        out.append(f"Not explained: the motion that the {sensor} reads differs by {100.0 * share:.0f} % from that of the poses.")
+        differs = f"the motion that the {sensor} reads differs by {100.0 * share:.0f} % from that of the poses"
+        out.append(f"Not explained: {differs}.")
     out += [f"Not tested: {', '.join(names)}: {why}." for why, names in _grouped(report.not_tested).items()]
     return out
 

@@ -1,4 +1,7 @@
-"""Unit, frame (body, world, or rates of Euler angles) and axes P, signed or turned, in which a sensor reads its motion."""
+"""Unit, frame and axes P in which a sensor reads its motion.
+
+A frame is the body's, the world's, or that of the rates of Euler angles; axes are signed ones, or turned.
+"""
 
 from __future__ import annotations
 
@@ -32,11 +35,12 @@ RIGHT = np.array([1.0, 1.0, 0.0])  # of the parts in a right simulation
 class Hypotheses:
     """Parts of a motion in each frame, the right one first, of which a signal may be made.
 
-    Its bias is free, or at most `MOST_BIAS`.
+    Its bias is free, or at most `MOST_BIAS`. With `turns` its axes may be turned, too.
     """
 
     frames: Mapping[str, Parts]
     free_bias: bool
+    turns: bool
 
     def frame(self, y: Vectors) -> tuple[str, Matrix]:
         """Frame of a signal, and its axes P: the simplest that explains as much as any."""
@@ -59,6 +63,8 @@ class Hypotheses:
         for frame, x in self.frames.items():
             each = zip(PERMUTATIONS, _least(y, x, PERMUTATIONS, free_bias=self.free_bias), strict=True)
             out += [(left, len(out) + rank, frame, P) for rank, (P, left) in enumerate(each)]
+        if not self.turns:
+            return out
         frame, x = next(iter(self.frames.items()))
         P = self._turned(y, x @ RIGHT[: x.shape[2]])
         if not is_signed(P):

@@ -25,7 +25,7 @@ FOURTH_ORDER = 0.42  # of the period of its cut-off, by which a Butterworth filt
 
 
 def most_filter_delays(sim: Recording, fit: KinematicFit) -> tuple[float, float]:
-    """Most delays (sample periods) of the filters that the noise of gyro and accelerometer shows; 0 for white noise.
+    """Most delays (sample periods) of the sensors' filters, by their noise; 0 for white noise.
 
     A residual counts beside poses that come as late as the sensor does: what a delay of all frequencies leaves is no noise, nor
     is what a mean leaves, as a difference of attitudes is one.
@@ -57,7 +57,10 @@ def _is_mean(
 
 
 def most_filter_delay(residual: Float64[np.ndarray, "n 3"], samples: Float64[np.ndarray, "m 3"]) -> float:
-    """Most delay (sample periods) of a filter that noise shows; quartiles of short segments are those between two impacts."""
+    """Most delay (sample periods) of a filter that the noise shows; 0 for white noise.
+
+    Quartiles of short segments are those between two impacts.
+    """
     both = []
     for x in (residual, samples):
         f, _, parts = spectrogram(x, 1.0, window="hann", nperseg=min(SHORT, len(x)), axis=0)

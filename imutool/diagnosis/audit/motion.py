@@ -1,4 +1,4 @@
-"""Fit of a simulated IMU to the motion of its poses: gravity, frame, axes, transport term, point, timing.
+"""Fit of a simulated IMU to its poses: gravity, frame, axes, transport term, point, timing.
 
 The samples are compared with the motion of the simulation's own poses. First the frame (body or world) and the axes (48 signed
 permutations P) of each sensor are chosen by least squares. Then the parts of the specific force are weighed, m and k and c
@@ -152,12 +152,12 @@ def _force_parts(k: Kinematics) -> Float64[np.ndarray, "n 3 3"]:
 
 
 def _of_gyro(k: Kinematics) -> Hypotheses:
-    return Hypotheses({frame: k.shown(rate[:, :, None]) for frame, rate in k.rates().items()}, free_bias=True)
+    return Hypotheses({frame: k.shown(rate[:, :, None]) for frame, rate in k.rates().items()}, free_bias=True, turns=True)
 
 
 def _of_accel(k: Kinematics, parts: Float64[np.ndarray, "n 3 p"]) -> Hypotheses:
     frames = {"body": parts, "world": np.einsum("nij,njp->nip", k.R_wb, parts)}
-    return Hypotheses({frame: k.shown(x) for frame, x in frames.items()}, free_bias=False)
+    return Hypotheses({frame: k.shown(x) for frame, x in frames.items()}, free_bias=False, turns=True)
 
 
 def _solved(

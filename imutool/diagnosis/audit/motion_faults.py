@@ -1,4 +1,4 @@
-"""Kinematic faults of a simulated IMU, by the parts of its motion; and how much of it nothing explains."""
+"""Kinematic faults of a simulated IMU, and how much of its motion nothing explains."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def motion_faults(k: Kinematics, fit: KinematicFit, filters: tuple[float, float]
 
 
 def unexplained(k: Kinematics, fit: KinematicFit, faults: Sequence[FaultFound]) -> dict[str, float]:
-    """Shares of the sensors' motions (root mean square) that neither the poses nor a fault nor noise explain, where large.
+    """Large shares of the sensors' motions that neither poses nor a fault nor noise explain.
 
-    Medians are those between impacts.
+    A share is one of the root mean square; medians are those between impacts.
     """
     scaled = {fault.fault for fault in faults} & {"other_clock", "gravity_only"}
     out: dict[str, float] = {}
