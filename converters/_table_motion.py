@@ -18,6 +18,7 @@ from ._table_units import ACCEL_SI, GYRO_SI, STANDARD_GRAVITY, TIME_NS, gravity_
 
 LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
 STEADY_BAND = 0.3  # share by which the steady part of the acceleration may differ from gravity
+DECIDING_BAND = 0.15  # the same, where it decides the unit
 NO_GRAVITY = r"(user|free)_?acc"  # in names of accelerations without gravity
 WITH_GRAVITY = r"(^|_)(raw|specific_?force)(_|$)"
 CORE_MOTION = {  # names of `CMDeviceMotion` on iOS and watchOS, as several programs write them
@@ -96,7 +97,9 @@ def settle_accel_unit(proposal: Proposal, columns: Columns) -> None:
     t_ns, gyro, accel = rows
     steady = steady_force(t_ns, gyro * GYRO_SI[str(proposal.entries["gyro_unit"])], accel)
     near = [
-        u for u, size in ACCEL_SI.items() if steady is not None and abs(steady * size / STANDARD_GRAVITY - 1.0) < STEADY_BAND
+        unit
+        for unit, size in ACCEL_SI.items()
+        if steady is not None and abs(steady * size / STANDARD_GRAVITY - 1.0) < DECIDING_BAND
     ]
     if len(near) == 1:
         reason = f"with the gyro's turns taken out, the acceleration has a steady part of {steady:.4g}: gravity in {near[0]}"

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from imutool.diagnosis.audit.bandwidth import most_filter_delay
+from imutool.diagnosis.audit.bandwidth import most_filter_delays
 from imutool.diagnosis.audit.faults import FAULTS, FaultFound, found
-from imutool.diagnosis.audit.motion import KinematicFit, Kinematics, kinematic_fit, kinematics, motion_faults, units
+from imutool.diagnosis.audit.motion import KinematicFit, Kinematics, kinematic_fit, kinematics, units
+from imutool.diagnosis.audit.motion_faults import motion_faults, unexplained
 from imutool.diagnosis.audit.noise import Expected, noise_faults
 from imutool.diagnosis.audit.simulation import AT_BODY, Mount, read_simulation
 from imutool.diagnosis.audit.spectral_lines import SpectralLine, by_differences, spectral_lines
@@ -30,6 +31,7 @@ from imutool.units import AXES, SENSORS
 
 BY_RECORDING = ("body_centre", "clipping_absent", "digits_absent", "bandwidth_absent")
 LEAST_ARM_M = 0.02  # of the recording's sensor from its poses' point
+TIMING = ("backward_difference", "step_delay", "early_stamps")
 BY_NOISE = ("noise_absent", "noise_per_sample", "noise_density")
 
 
@@ -40,6 +42,7 @@ class AuditReport(Report, frozen=True, tag="imutool.audit/1"):
         faults: each with its signal, numbers, equation and the report of a simulator that had it.
         tested: names of the faults that were looked for.
         not_tested: the others, with the reason.
+        unexplained: shares of the sensors' motions (root mean square) that neither poses nor a fault explain, where large.
     """
 
     sim: str
@@ -47,6 +50,7 @@ class AuditReport(Report, frozen=True, tag="imutool.audit/1"):
     faults: tuple[FaultFound, ...]
     tested: tuple[str, ...]
     not_tested: Mapping[str, str]
+    unexplained: Mapping[str, float]
 
 
 def audit(
@@ -70,7 +74,7 @@ def audit(
     recording, real_mount = (None, AT_BODY) if real is None else read_simulation(real, imu=imu, simulated=False)
     sheet = datasheet.read(noise)
     try:
-        faults, untold = _faults(simulated, recording, sheet, (mount, real_mount))
+        faults, untold, left = _faults(simulated, recording, sheet, (mount, real_mount))
     except DataError as error:
         raise error.at(sim) from error
     not_tested = dict(_not_tested(recording, sheet))
@@ -80,7 +84,7 @@ def audit(
             f"there are lines, at {at}, and the poses are too slow or too noisy to show whether the body moves so"
         )
     tested = tuple(name for name in FAULTS if name not in not_tested)
-    return AuditReport(str(sim), None if real is None else str(real), tuple(faults), tested, not_tested)
+    return AuditReport(str(sim), None if real is None else str(real), tuple(faults), tested, not_tested, left)
 
 
 def simulator_faults(
@@ -98,26 +102,28 @@ def simulator_faults(
 
 def _faults(
     sim: Recording, real: Recording | None, sheet: datasheet.Noise, mounts: tuple[Mount, Mount]
-) -> tuple[list[FaultFound], list[SpectralLine]]:
-    """Faults, and spectral lines whose cause the poses do not show."""
+) -> tuple[list[FaultFound], list[SpectralLine], dict[str, float]]:
+    """Faults, spectral lines whose cause the poses do not show, and large shares of the motion that nothing explains."""
     if not sim.truths:
         raise sim.no_truth("a simulation without poses", "a simulation with the poses of its body")
     sim, moved, by_motion = _in_si(sim)
     fit = kinematic_fit(moved)
     samples, rate_hz = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1), 1.0 / sim.imu.period_s
-    late = [most_filter_delay(fit.residual[:, part], samples[:, part]) for part in (slice(0, 3), slice(3, 6))]
-    by_motion += motion_faults(moved, fit, (late[0], late[1]))
+    by_motion += motion_faults(moved, fit, most_filter_delays(sim, fit))
     expected = [Expected.of_sheet(sheet)] if _has_noise(sheet) else []
     expected += [] if real is None else [Expected.of_recording(real.imu)]
+    left = unexplained(moved, fit, by_motion)
+    if left:  # of what is no motion of the body no delay can be told
+        by_motion = [fault for fault in by_motion if fault.fault not in TIMING or fault.signal not in (*left, "both")]
     arm = np.array([fit.estimates[axis].value for axis in AXES])
     lines_found = spectral_lines(samples, fit.residual, rate_hz, *by_differences(sim.truth, arm))
     faults, untold = noise_faults(sim.imu, fit.residual, expected, lines_found)
     if any(fault.fault == "repeated_samples" for fault in faults):  # which are late by half of the physics step
-        by_motion = [fault for fault in by_motion if fault.fault not in ("backward_difference", "step_delay")]
+        by_motion = [fault for fault in by_motion if fault.fault not in TIMING[:2]]
     faults = by_motion + faults
     if real is not None and real.truths:
         faults += _body_centre(fit, real, mounts)
-    return faults, untold
+    return faults, untold, left
 
 
 def _in_si(sim: Recording) -> tuple[Recording, Kinematics, list[FaultFound]]:
@@ -153,6 +159,9 @@ def lines(report: AuditReport) -> list[str]:
         out.append(f"{fault.fault}: {fault.sentence}{f' ({numbers})' if numbers else ''}.")
         out.append(f"    {fault.equation}; reported in {fault.source}")
         out += [f"    No fault if {fault.unless}."] if fault.unless else []
+    for sensor, share in report.unexplained.items():
+        differs = f"the motion that the {sensor} reads differs by {100.0 * share:.0f} % from that of the poses"
+        out.append(f"Not explained: {differs}.")
     out += [f"Not tested: {', '.join(names)}: {why}." for why, names in _grouped(report.not_tested).items()]
     return out
 

@@ -3,19 +3,57 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.signal import spectrogram
 
 from imutool.array_types import Float64
 from imutool.diagnosis.audit.faults import FaultFound, found
+from imutool.diagnosis.audit.motion import KinematicFit, kinematic_fit, kinematics
+from imutool.diagnosis.audit.timing import clear
 from imutool.diagnosis.result import Estimate
+from imutool.recording import Recording
 from imutool.units import Sensor
 
 BANDS = ((0.2, 0.35), (0.5, 0.65), (0.85, 0.97))  # of Nyquist
 FALLS, STEP, WHITE = 0.35, 0.75, 0.75  # of the noise that is left near Nyquist, and from band to band; of white noise
 SEGMENT, SHORT = 1024, 32  # samples; a body that never rests is calm between two impacts
+MEAN_BAND = 0.3  # by which a curvature may differ from that of a mean; of a filter of first order it is three times as large
+WINDOW_BINS = 0.5  # by which a Hann window moves a cut-off up
 FOURTH_ORDER = 0.42  # of the period of its cut-off, by which a Butterworth filter of fourth order is late; of first order 0.16
+
+
+def most_filter_delays(sim: Recording, fit: KinematicFit) -> tuple[float, float]:
+    """Most delays (sample periods) of the sensors' filters, by their noise; 0 for white noise.
+
+    A residual counts beside poses that come as late as the sensor does: what a delay of all frequencies leaves is no noise, nor
+    is what a mean leaves, as a difference of attitudes is one.
+    """
+    out = []
+    for name, samples, part in (("tau_g", sim.imu.gyro, slice(0, 3)), ("tau_f", sim.imu.accel, slice(3, 6))):
+        late, left = fit.estimates[name], fit.residual[:, part]
+        if clear(late):
+            k = kinematics(replace(sim, imu=replace(sim.imu, t_ns=sim.imu.t_ns - round(late.value * 1e9))))
+            then = kinematic_fit(k)
+            left, rate = then.residual[:, part], k.rates()[then.frames[0]]
+            if name == "tau_g" and _is_mean(left, rate, k.t_s, late.value):
+                out.append(0.0)
+                continue
+        out.append(most_filter_delay(left, samples))
+    return out[0], out[1]
+
+
+def _is_mean(
+    left: Float64[np.ndarray, "n 3"], rate: Float64[np.ndarray, "n 3"], t_s: Float64[np.ndarray, " n"], late_s: float
+) -> bool:
+    """Whether a mean of the rate over twice its delay leaves this of a fitted scale and delay: tau^2 / 6 of its curvature."""
+    rate = rate - rate.mean(axis=0)
+    bent = np.gradient(np.gradient(rate, t_s, axis=0), t_s, axis=0)
+    left, bent = (x - x.mean(axis=0) - rate * (x * rate).sum() / (rate**2).sum() for x in (left, bent))
+    size = float((left * bent).sum() / (bent**2).sum())
+    explained = size * float((left * bent).sum()) / max(float((left**2).sum()), 1e-300)
+    return explained > 0.5 and abs(6.0 * size / late_s**2 - 1.0) < MEAN_BAND
 
 
 def most_filter_delay(residual: Float64[np.ndarray, "n 3"], samples: Float64[np.ndarray, "m 3"]) -> float:
@@ -35,7 +73,8 @@ def most_filter_delay(residual: Float64[np.ndarray, "n 3"], samples: Float64[np.
     if not len(half):  # no noise
         return 0.0
     above, below = np.log(2.0 * np.maximum(level[half[-1] : half[-1] + 2] / level.max(), 1e-300))
-    return FOURTH_ORDER / float(f[half[-1] + 1] + f[1] * above / (above - min(below, 0.0)))
+    bins = half[-1] + 1 + above / (above - min(below, 0.0))
+    return FOURTH_ORDER / float(f[1] * (bins - WINDOW_BINS))
 
 
 def bandwidth_faults(

@@ -60,14 +60,26 @@ FAULTS: Mapping[str, Fault] = {
         f"{GITHUB}/ethz-asl/rotors_simulator/pull/272",
         unless="the integrator is semi-implicit Euler: then the poses are half a step early",
     ),
-    "step_delay": Fault("comes one step late", "x(t) = x_true(t - T)", f"{GITHUB}/PegasusSimulator/PegasusSimulator/pull/147"),
+    "step_delay": Fault(
+        "comes late, by a step or more", "x(t) = x_true(t - T)", f"{GITHUB}/PegasusSimulator/PegasusSimulator/pull/147"
+    ),
     "early_stamps": Fault(
         "is stamped one step early: with the beginning of the step at whose end it was read",
         "x(t) = x_true(t + T)",
         f"{GITHUB}/gazebosim/gazebo-classic/issues/600",
     ),
+    "other_clock": Fault(
+        "has stamps of another clock than that of the physics",
+        "gyro = s omega, accel = s^2 R_wb^T a_w - R_wb^T g_w, s seconds of the stamps in one of the physics",
+        f"{GITHUB}/microsoft/AirSim/issues/4232",
+    ),
     "world_frame": Fault(
         "is given in the world frame, not the body's", "x = R_wb x_body", f"{GITHUB}/carla-simulator/carla/pull/2998"
+    ),
+    "euler_rates": Fault(
+        "holds the rates of roll, pitch and yaw, not the angular rate of the body",
+        "gyro = d(roll, pitch, yaw)/dt",
+        f"{GITHUB}/morse-simulator/morse/pull/667",
     ),
     "left_handed": Fault(
         "has left-handed axes", "x = P x_body, P a signed permutation, det P < 0", f"{GITHUB}/carla-simulator/carla/issues/4008"
@@ -76,6 +88,12 @@ FAULTS: Mapping[str, Fault] = {
         "has permuted axes",
         "x = P x_body, P a signed permutation, det P > 0",
         f"{GITHUB}/fsstudio-team/ZeroSimROSUnity/issues/9",
+        unless="the sensor is mounted so: state its mount on /tf_static",
+    ),
+    "turned_axes": Fault(
+        "is turned against the body of its poses",
+        "x = R x_body, R a rotation",
+        f"{GITHUB}/ArduPilot/ardupilot_gazebo/issues/139",
         unless="the sensor is mounted so: state its mount on /tf_static",
     ),
     "wrong_unit": Fault(

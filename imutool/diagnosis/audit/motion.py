@@ -1,8 +1,8 @@
-"""Kinematic faults of a simulated IMU: gravity, frame, axes, transport term, point, timing.
+"""Fit of a simulated IMU to its poses: gravity, frame, axes, transport term, point, timing.
 
 The samples are compared with the motion of the simulation's own poses. First the frame (body or world) and the axes (48 signed
 permutations P) of each sensor are chosen by least squares. Then the parts of the specific force are weighed, m and k and c
-being 1, 1 and 0 in a right simulation::
+being 1, 1 and 0 in a right simulation. A gyro may also hold the rates of roll, pitch and yaw::
 
     accel = P (m R^T a_w - k R^T g_w - c omega x v + alpha x r + omega x (omega x r) - tau_a R^T j_w + tau_f omega x f) + b
     gyro = P (omega - tau_g alpha) + b
@@ -21,18 +21,14 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
-from imutool.diagnosis.audit.axes import Hypotheses
-from imutool.diagnosis.audit.faults import FaultFound, found
-from imutool.diagnosis.audit.timing import NEAR, clear, timing_faults, with_unit
+from imutool.diagnosis.audit.axes import Hypotheses, Matrix, Vectors
 from imutool.diagnosis.result import Estimate
 from imutool.errors import DataError
 from imutool.inertial.kinematics import G_W
 from imutool.recording import Recording
 from imutool.sensor.trajectory import smooth_motion
-from imutool.units import AXES, SENSORS, Sensor
+from imutool.units import SENSORS, Sensor
 
-Vectors = Float64[np.ndarray, "n 3"]
-Matrix = Float64[np.ndarray, "3 3"]
 JERK_S = 1e-3  # half of the step of a central difference
 BLOCK_S = 2.0  # of the robust covariance
 SHOWN, ORDER = 0.5, 4  # of a curve's cut-off, up to which it follows a motion to 2 %; of the filter
@@ -40,7 +36,8 @@ LEAST_BLOCK = 4.0  # periods of the highest frequency in a block, so that blocks
 BANDS = (1.0, 0.5, 0.25)  # of the band that the poses show: a curve follows the slower motion better
 AGREE = 3.0  # standard deviations by which two bands may differ
 BIAS_RIDGE = 1e-6  # of a bias: a body that stays level shows it and gravity alike, and gravity is the larger
-LEAST_ARM_M, LEAST_S = 5e-3, 5.0
+LEAST_COSINE = 1e-3  # of the pitch, towards which rates of roll and yaw grow without bound
+LEAST_S = 5.0
 OTHER_UNIT: Mapping[Sensor, float] = {"gyro": np.pi / 180.0, "accel": 9.80665}  # deg/s, standard gravity
 NAMES = ("m", "k", "c", "x", "y", "z", "tau_a", "tau_f")
 
@@ -65,6 +62,14 @@ class Kinematics:
         """World vectors in the body frame."""
         return np.asarray(np.einsum("nji,nj->ni", self.R_wb, x_w))
 
+    def rates(self) -> dict[str, Vectors]:
+        """Angular rate in the body, in the world, and as rates of roll, pitch and yaw (R_wb = Rz Ry Rx)."""
+        (p, q, r), (s, sin_roll, cos_roll) = self.omega.T, self.R_wb[:, 2].T  # both times the cosine of the pitch, -s its sine
+        level = np.maximum(np.hypot(sin_roll, cos_roll), LEAST_COSINE)
+        yaw = (q * sin_roll + r * cos_roll) / level**2
+        euler = np.stack([p - s * yaw, (q * cos_roll - r * sin_roll) / level, yaw], axis=1)
+        return {"body": self.omega, "world": np.einsum("nij,nj->ni", self.R_wb, self.omega), "euler": euler}
+
     def shown(self, x: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "n ..."]:
         """Columns in the band of the motion that the poses show, without delay."""
         share = 2.0 * self.band_hz * self.period_s  # of Nyquist
@@ -76,7 +81,7 @@ class KinematicFit:
     """Fitted model of both sensors: estimates, frames, axes and residual (gyro, accel)."""
 
     estimates: dict[str, Estimate]
-    world: tuple[bool, bool]
+    frames: tuple[str, str]
     axes: tuple[Matrix, Matrix]
     residual: Float64[np.ndarray, "n 6"]
 
@@ -114,32 +119,30 @@ def kinematics(log: Recording) -> Kinematics:
 def kinematic_fit(k: Kinematics) -> KinematicFit:
     """Frames, axes and parts of the samples that explain them best."""
     parts = _force_parts(k)
-    gyro_world, P_gyro = _hypotheses(k, k.omega[:, :, None], free_bias=True).frame(k.shown(k.gyro))
-    accel_world, P_accel = _hypotheses(k, parts, free_bias=False).frame(k.shown(k.accel))
+    rates = k.rates()
+    gyro_frame, P_gyro = _of_gyro(k).frame(k.shown(k.gyro))
+    accel_frame, P_accel = _of_accel(k, parts).frame(k.shown(k.accel))
     force = k.to_body(k.a_w - G_W)
     arms = np.stack([np.cross(k.alpha, e) + np.cross(k.omega, np.cross(k.omega, e)) for e in np.eye(3)], axis=2)
     late = np.stack([-k.to_body(k.j_w), np.cross(k.omega, force)], axis=2)
     columns = np.concatenate([parts, arms, late], axis=2)
-    if accel_world:  # there neither gravity nor the transport term nor the attitude is anything of its own
+    if accel_frame == "world":  # there neither gravity nor the transport term nor the attitude is anything of its own
         columns = np.einsum("nij,njp->nip", k.R_wb, columns)
         columns[:, :, [2, 7]] = 0.0
     theta, std, left_accel = _solved(k, k.accel @ P_accel, columns, np.array([1.0, 1.0] + [0.0] * 6))
     estimates = {name: Estimate(float(a), float(s), "-") for name, a, s in zip(NAMES, theta, std, strict=True)}
-    columns = np.stack([k.omega, -k.alpha], axis=2)
-    columns = np.einsum("nij,njp->nip", k.R_wb, columns) if gyro_world else columns
+    slope = k.alpha if gyro_frame == "body" else np.gradient(rates[gyro_frame], k.t_s, axis=0)
+    columns = np.stack([rates[gyro_frame], -slope], axis=2)
     theta, std, left_gyro = _solved(k, k.gyro @ P_gyro, columns, np.array([1.0, 0.0]))
     estimates["scale"], estimates["tau_g"] = (Estimate(float(a), float(s), "-") for a, s in zip(theta, std, strict=True))
     residual = np.concatenate([left_gyro, left_accel], axis=1)
-    return KinematicFit(estimates, (gyro_world, accel_world), (P_gyro, P_accel), residual)
+    return KinematicFit(estimates, (gyro_frame, accel_frame), (P_gyro, P_accel), residual)
 
 
 def units(k: Kinematics) -> dict[Sensor, float]:
     """Factor of each sensor's samples: 1, or what makes rad/s of deg/s and m/s² of g."""
-    samples, parts = {"gyro": k.gyro, "accel": k.accel}, {"gyro": k.omega[:, :, None], "accel": _force_parts(k)}
-    return {
-        sensor: _hypotheses(k, parts[sensor], free_bias=sensor == "gyro").unit(k.shown(samples[sensor]), OTHER_UNIT[sensor])
-        for sensor in SENSORS
-    }
+    samples, ways = {"gyro": k.gyro, "accel": k.accel}, {"gyro": _of_gyro(k), "accel": _of_accel(k, _force_parts(k))}
+    return {sensor: ways[sensor].unit(k.shown(samples[sensor]), OTHER_UNIT[sensor]) for sensor in SENSORS}
 
 
 def _force_parts(k: Kinematics) -> Float64[np.ndarray, "n 3 3"]:
@@ -148,51 +151,13 @@ def _force_parts(k: Kinematics) -> Float64[np.ndarray, "n 3 3"]:
     return np.stack([k.to_body(k.a_w), gravity, centripetal], axis=2)
 
 
-def _hypotheses(k: Kinematics, parts: Float64[np.ndarray, "n 3 p"], *, free_bias: bool) -> Hypotheses:
-    return Hypotheses(k.shown(parts), k.shown(np.einsum("nij,njp->nip", k.R_wb, parts)), free_bias=free_bias)
+def _of_gyro(k: Kinematics) -> Hypotheses:
+    return Hypotheses({frame: k.shown(rate[:, :, None]) for frame, rate in k.rates().items()}, free_bias=True, turns=True)
 
 
-def motion_faults(k: Kinematics, fit: KinematicFit, filters: tuple[float, float] = (0.0, 0.0)) -> list[FaultFound]:
-    """Faults of gravity, frame, axes, transport term, point and timing.
-
-    Delays (in sample periods) up to those of the sensors' own `filters` are no fault.
-    """
-    timing = timing_faults(fit.estimates, k.period_s, filters)
-    return [*_frame_faults(fit), *_force_faults(fit), *timing, *_arm_faults(fit.estimates)]
-
-
-def _arm_faults(estimates: Mapping[str, Estimate]) -> list[FaultFound]:
-    arm = {axis: with_unit(estimates[axis], "m") for axis in AXES}
-    far = np.linalg.norm([r.value for r in arm.values()]) > LEAST_ARM_M
-    return [found("lever_arm", "accel", **arm)] if far and any(clear(r) for r in arm.values()) else []
-
-
-def _frame_faults(fit: KinematicFit) -> list[FaultFound]:
-    flipped = any(np.linalg.det(P) < 0.0 for P in fit.axes)
-    turned = tuple(not np.array_equal(P, np.eye(3)) for P in fit.axes)
-    name = "left_handed" if flipped else "permuted_axes"
-    return [found("world_frame", signal) for signal in _which(fit.world)] + [found(name, signal) for signal in _which(turned)]
-
-
-def _force_faults(fit: KinematicFit) -> list[FaultFound]:
-    m, k, c = (fit.estimates[name] for name in ("m", "k", "c"))
-    out = []
-    gravity = {0: "coordinate_acceleration", 2: "gravity_doubled", -1: "gravity_sign"}
-    for whole, name in gravity.items():
-        if abs(k.value - whole) < NEAR and clear(k, 1.0):
-            out.append(found(name, "accel", gravity=k))
-    if abs(m.value) < NEAR and clear(m, 1.0) and abs(k.value - 1.0) < NEAR:
-        out.append(found("gravity_only", "accel", acceleration=m))
-    elif abs(c.value - 1.0) < 2.0 * NEAR and clear(c):
-        out.append(found("transport_term", "accel", missing=c))
-    return out
-
-
-def _which(flags: tuple[bool, ...]) -> list[str]:
-    """Signals that are marked: none, one, or both."""
-    if all(flags):
-        return ["both"]
-    return [signal for signal, flag in zip(("gyro", "accel"), flags, strict=True) if flag]
+def _of_accel(k: Kinematics, parts: Float64[np.ndarray, "n 3 p"]) -> Hypotheses:
+    frames = {"body": parts, "world": np.einsum("nij,njp->nip", k.R_wb, parts)}
+    return Hypotheses({frame: k.shown(x) for frame, x in frames.items()}, free_bias=False, turns=True)
 
 
 def _solved(

@@ -26,10 +26,10 @@ def timing_faults(estimates: Mapping[str, Estimate], period_s: float, filters: t
     where the gyro is late by a part of a step, unless both are differences of explicit states. No difference and no integrator
     makes the attitude late: where it is, a step of the physics lies between reading and stamp, however short.
     """
-    gyro, accel, attitude = (
-        _after_filter(estimates[name], late * period_s)
-        for name, late in (("tau_g", filters[0]), ("tau_a", filters[1]), ("tau_f", filters[1]))
-    )
+    gyro, accel, attitude = (estimates[name] for name in ("tau_g", "tau_a", "tau_f"))
+    gyro = _after_filter(gyro, filters[0] * period_s)
+    if accel.value < attitude.value + CERTAIN * np.hypot(accel.std, attitude.std):  # a filter makes gravity late, too
+        accel, attitude = (_after_filter(tau, filters[1] * period_s) for tau in (accel, attitude))
     steps = {"gyro": _delay(gyro, period_s, LEAST_GYRO_DELAY), "accel": _delay(accel, period_s, LEAST_DELAY)}
     together = abs(accel.value - attitude.value) < 3.0 * np.hypot(accel.std, attitude.std) + NEAR * period_s
     whole = together and steps["accel"] in ("step_delay", "early_stamps")

@@ -82,7 +82,7 @@ def _convention(sensor: Sensor, y: Readings, x: Readings) -> _Convention:
     same = _Convention(1.0, np.eye(3), np.inf, needed=False)
     if len(y) == 0 or not y.any():
         return same
-    like = Hypotheses(x[:, :, None], x[:, :, None], free_bias=sensor == "gyro")
+    like = Hypotheses({"reference": x[:, :, None]}, free_bias=sensor == "gyro", turns=False)
     other = OTHER_UNIT[sensor]
     factor = next((by for by in (other, 1.0 / other) if like.unit(y, by) != 1.0), 1.0)
     _, P = like.frame(y * factor)

@@ -19,7 +19,8 @@ from support.seeds import seeds
 
 from imutool.diagnosis.audit import audit, lines, simulator_faults, simulator_remarks
 from imutool.diagnosis.audit.faults import FAULTS
-from imutool.diagnosis.audit.motion import kinematic_fit, kinematics, motion_faults
+from imutool.diagnosis.audit.motion import kinematic_fit, kinematics
+from imutool.diagnosis.audit.motion_faults import motion_faults
 from imutool.diagnosis.audit.noise import Expected, noise_faults
 from imutool.diagnosis.audit.spectral_lines import spectral_lines
 from imutool.diagnosis.diagnose import diagnose

@@ -1,23 +1,25 @@
-"""What looks like a fault of a simulator: impacts, digits, filters, folded motion; units."""
+"""What looks like a fault of a simulator: impacts, digits, filters, folded motion; units, delays without noise."""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import butter, sosfilt
+from scipy.signal import butter, sosfilt, sosfilt_zi
 from support.benchmarks import benchmark
 
 from imutool.config import build
-from imutool.diagnosis.audit import simulator_faults
+from imutool.diagnosis.audit import audit, lines, simulator_faults
 from imutool.diagnosis.audit.bandwidth import most_filter_delay
 from imutool.diagnosis.audit.motion import kinematic_fit, kinematics
 from imutool.diagnosis.audit.noise import Expected, fast_noise, noise_faults
 from imutool.diagnosis.audit.timing import clear, timing_faults
 from imutool.diagnosis.result import Estimate
+from imutool.mcap_io.write import write
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu
 
@@ -140,3 +142,38 @@ def test_delays_of_gyro_acceleration_and_attitude_are_weighed_together(
 ) -> None:
     estimates = {name: Estimate(0.01 * value, 0.01 * std, "s") for name, (value, std) in periods.items()}
     assert {(fault.fault, fault.signal) for fault in timing_faults(estimates, 0.01, (0.0, 0.0))} == accused
+
+
+@pytest.mark.parametrize(("fault", "steps"), [("step_delay", 1.0), ("step_delay", 4.0), ("backward_difference", 0.5)])
+def test_a_delay_is_named_where_a_simulator_has_no_noise(fault: str, steps: float) -> None:
+    """What a delay left of a motion was taken for the noise of a filter, and the delay for that of the filter."""
+    motion, period_s = bench.Motion.drawn(np.random.default_rng(5)), 1.0 / 400.0
+    t = np.arange(round(DURATION_S / period_s)) * period_s
+    gyro, accel = motion.rate(t - steps * period_s), motion.force(t - steps * period_s)
+    if fault == "backward_difference":
+        gyro, accel = (motion.attitude(t - period_s).inv() * motion.attitude(t)).as_rotvec() / period_s, motion.force(t)
+    (found,) = simulator_faults(bench._log(motion, t, np.concatenate([gyro, accel], axis=1)), None, Noise())
+    assert found.fault == fault
+    assert found.parameters["delay"].value == pytest.approx(steps * period_s, rel=0.02)
+
+
+def test_a_filter_is_no_delay_with_noise_or_without() -> None:
+    motion, t = bench.Motion.drawn(np.random.default_rng(3)), np.arange(8000) / 400.0
+    ideal = np.concatenate([motion.rate(t), motion.force(t)], axis=1)
+    sos = butter(2, 20.0, fs=400.0, output="sos")
+    for noise in (0.0, 1.0):
+        samples = ideal + noise * np.repeat([2e-3, 2e-2], 3) * np.random.default_rng(4).normal(size=ideal.shape)
+        filtered, _ = sosfilt(sos, samples, axis=0, zi=sosfilt_zi(sos)[:, :, None] * samples[0])
+        assert simulator_faults(bench._log(motion, t, filtered), None, Noise()) == []
+
+
+@pytest.mark.parametrize("sensor", ["gyro", "accel"])
+def test_motion_that_is_not_that_of_the_poses_is_told(sensor: str, tmp_path: Path) -> None:
+    """It is no fault with a name, and was no fault at all."""
+    motion, t = bench.Motion.drawn(np.random.default_rng(3)), np.arange(3200) / 200.0
+    gyro, accel = motion.rate(t), motion.force(t)
+    gyro, accel = (1.4 * gyro, accel) if sensor == "gyro" else (gyro, accel + np.abs(motion.force(t, 0.0)))
+    write(bench._log(motion, t, np.concatenate([gyro, accel], axis=1)), tmp_path / "sim.mcap")
+    report = audit(tmp_path / "sim.mcap")
+    assert (report.faults, list(report.unexplained)) == ((), [sensor])
+    assert any(f"the motion that the {sensor} reads differs by" in line for line in lines(report))

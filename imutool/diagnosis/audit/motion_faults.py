@@ -1,0 +1,107 @@
+"""Kinematic faults of a simulated IMU, and how much of its motion nothing explains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imutool.diagnosis.audit.axes import is_signed
+from imutool.diagnosis.audit.faults import FaultFound, found
+from imutool.diagnosis.audit.motion import BLOCK_S, KinematicFit, Kinematics
+from imutool.diagnosis.audit.timing import NEAR, clear, timing_faults, with_unit
+from imutool.diagnosis.result import Estimate
+from imutool.units import AXES, SENSORS, Sensor
+
+LEAST_CLOCK = 0.05  # by which a clock is another: smoothing may take as much of a fast motion
+LEAST_OVER_NOISE = 3.0  # deviations of noise
+LEAST_ARM_M = 5e-3
+
+
+def motion_faults(k: Kinematics, fit: KinematicFit, filters: tuple[float, float] = (0.0, 0.0)) -> list[FaultFound]:
+    """Faults of gravity, frame, axes, transport term, point and timing.
+
+    Delays (in sample periods) up to those of the sensors' own `filters` are no fault.
+    """
+    timing = timing_faults(fit.estimates, k.period_s, filters)
+    return [*_frame_faults(k, fit), *_force_faults(fit), *_clock_faults(fit.estimates), *timing, *_arm_faults(fit.estimates)]
+
+
+def unexplained(k: Kinematics, fit: KinematicFit, faults: Sequence[FaultFound]) -> dict[str, float]:
+    """Large shares of the sensors' motions that neither poses nor a fault nor noise explain.
+
+    A share is one of the root mean square; medians are those between impacts.
+    """
+    scaled = {fault.fault for fault in faults} & {"other_clock", "gravity_only"}
+    out: dict[str, float] = {}
+    for sensor, samples, part, name in (("gyro", k.gyro, slice(0, 3), "scale"), ("accel", k.accel, slice(3, 6), "m")):
+        left = k.shown(fit.residual[:, part])
+        size, moved, above = (
+            float(np.median((x**2).sum(axis=1)))
+            for x in (left, k.shown(samples - samples.mean(axis=0)), fit.residual[:, part] - left)
+        )
+        noise = above * k.band_hz / max(0.5 / k.period_s - k.band_hz, k.band_hz)
+        share = float(np.sqrt(max(size - LEAST_OVER_NOISE**2 * noise, 0.0) / max(moved, 1e-300)))
+        scale = fit.estimates[name]
+        off = abs(scale.value - 1.0) / max(abs(scale.value), 1.0) if clear(scale, 1.0) and not scaled else 0.0
+        if max(share, off) > NEAR:
+            out[sensor] = float(np.hypot(share, off))
+    return out
+
+
+def _clock_faults(estimates: Mapping[str, Estimate]) -> list[FaultFound]:
+    s, m, k = (estimates[name] for name in ("scale", "m", "k"))
+    alike = abs(m.value - s.value**2) < NEAR * abs(s.value**2 - 1.0) and abs(k.value - 1.0) < LEAST_CLOCK
+    other = abs(s.value - 1.0) > LEAST_CLOCK and clear(s, 1.0) and clear(m, 1.0)
+    return [found("other_clock", "both", s=s)] if alike and other else []
+
+
+def _arm_faults(estimates: Mapping[str, Estimate]) -> list[FaultFound]:
+    arm = {axis: with_unit(estimates[axis], "m") for axis in AXES}
+    far = np.linalg.norm([r.value for r in arm.values()]) > LEAST_ARM_M
+    return [found("lever_arm", "accel", **arm)] if far and any(clear(r) for r in arm.values()) else []
+
+
+def _frame_faults(k: Kinematics, fit: KinematicFit) -> list[FaultFound]:
+    flipped = any(np.linalg.det(P) < 0.0 for P in fit.axes)
+    signed = [is_signed(P) for P in fit.axes]
+    other = [not np.allclose(P, np.eye(3)) for P in fit.axes]
+    flags = {
+        "world_frame": [frame == "world" for frame in fit.frames],
+        "euler_rates": [frame == "euler" for frame in fit.frames],
+        "left_handed" if flipped else "permuted_axes": [s and o for s, o in zip(signed, other, strict=True)],
+    }
+    out = [found(fault, signal) for fault, each in flags.items() for signal in _which(each)]
+    turned = [sensor for sensor, s in zip(SENSORS, signed, strict=True) if not s]
+    return out + [found("turned_axes", sensor, **_turn(k, fit, sensor)) for sensor in turned]
+
+
+def _turn(k: Kinematics, fit: KinematicFit, sensor: Sensor) -> dict[str, Estimate]:
+    """Rotation of the body's axes to the sensor's, with a deviation by blocks of what it leaves."""
+    accel = sensor == "accel"
+    left, samples = fit.residual[:, 3 * accel : 3 * accel + 3], k.accel if accel else k.gyro - k.gyro.mean(axis=0)
+    std = float(np.sqrt((k.shown(left) ** 2).sum() / (samples**2).sum() / max(k.t_s[-1] / BLOCK_S, 1.0)))
+    turn = Rotation.from_matrix(fit.axes[accel]).as_rotvec()
+    return {axis: Estimate(float(angle), std, "rad") for axis, angle in zip(AXES, turn, strict=True)}
+
+
+def _force_faults(fit: KinematicFit) -> list[FaultFound]:
+    m, k, c = (fit.estimates[name] for name in ("m", "k", "c"))
+    out = []
+    gravity = {0: "coordinate_acceleration", 2: "gravity_doubled", -1: "gravity_sign"}
+    for whole, name in gravity.items():
+        if abs(k.value - whole) < NEAR and clear(k, 1.0):
+            out.append(found(name, "accel", gravity=k))
+    if abs(m.value) < NEAR and clear(m, 1.0) and abs(k.value - 1.0) < NEAR:
+        out.append(found("gravity_only", "accel", acceleration=m))
+    elif abs(c.value - 1.0) < 2.0 * NEAR and clear(c):
+        out.append(found("transport_term", "accel", missing=c))
+    return out
+
+
+def _which(flags: Sequence[bool]) -> list[str]:
+    """Signals that are marked: none, one, or both."""
+    if all(flags):
+        return ["both"]
+    return [signal for signal, flag in zip(("gyro", "accel"), flags, strict=True) if flag]
