@@ -19,7 +19,7 @@ from ._table_hdf5 import load_hdf5, names_of_hdf5
 from ._table_headerless import as_table, name_headerless
 from ._table_json import is_json, load_json
 from ._table_mat import check_size, load_mat, names_of_mat
-from ._table_merged import join_stamps, sort_by_clock
+from ._table_merged import join_stamps, settle_zones, sort_by_clock
 from ._table_mocap import is_mocap, read_mocap
 from ._table_motion import add_gravity
 from ._table_names import TIME_WORDS, group_of, leaf_of, split_name, tells_apart
@@ -85,6 +85,7 @@ def load(path: Path, kind: str) -> Columns:
     join_stamps(columns)
     join_gps_weeks(columns)
     read_clocks_and_days(columns)
+    settle_zones(columns)
     sort_by_clock(columns)
     add_gravity(columns)
     if not columns.values:
@@ -216,6 +217,7 @@ def _add_arrow(table: Any, columns: Columns) -> None:
             continue
         if times := re.match("timestamp|duration", str(column.type)):
             columns.add(f"{name} [ns]", column.cast(f"{times[0]}[ns]").cast("int64").to_numpy())
+            columns.local_times.extend([] if getattr(column.type, "tz", None) else [f"{name} [ns]"])
         elif "string" in str(column.type):
             columns.add_labels(name, [str(text or "") for text in column.to_pylist()])
         else:

@@ -12,7 +12,8 @@ from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_pose_names import has_turns, pose_leaves, position_of
 from ._table_sensors import SENSORS
 from ._table_text import Columns
-from ._table_times import goes_on
+from ._table_times import goes_on, units_of_time, usual_step
+from ._table_units import TIME_NS
 
 LAST_S = 9_223_372_036  # in the year 2262, where nanoseconds in 64 bits end
 SECONDS = re.compile(r"(.*?)(?:secs?|seconds?|(?:unix|utc|posix)[ _]?time)(_\w+)?", re.IGNORECASE)
@@ -22,6 +23,8 @@ BELOW_SECONDS = {  # names of the rest of a second in a column of its own, and i
 }
 POSITIONS = r"(.*_)?(pos(e|ition)?s?|translations?|traj(ectory)?|locations?|xyz)(_.*)?"  # names of a table of positions
 MOST_STEPS = 4.0  # median steps of positions, over which none are interpolated
+QUARTER_NS, FARTHEST_NS, MOST_OFF_NS = 900 * 10**9, 14 * 3600 * 10**9, 60 * 10**9  # of zones; between two clocks of a table
+SINCE_1970 = rf"(.*_)?{TIME_WORDS}|.*(since_?1970|epoch|unix|posix).*"
 TIME_OF = rf"((?P<before>.+?)_)?{TIME_WORDS}|{TIME_WORDS}_(?P<behind>.+)"  # imu_time, time_gps
 
 
@@ -55,6 +58,27 @@ def join_stamps(columns: Columns) -> None:
             columns.texts[name] = texts
 
 
+def settle_zones(columns: Columns) -> None:
+    """Take the zone of dates that name none from a time since 1970 beside them; summer time may end among them."""
+    for local in columns.local_times:
+        dates = columns.values[local]
+        for column, values in columns.values.items():
+            name, unit = name_and_unit(column, columns.units.get(column, ""))
+            if column in columns.local_times or len(values) != len(dates) or not re.fullmatch(SINCE_1970, name or unit):
+                continue
+            times = values.astype(float)
+            units = [unit] if unit in TIME_NS else units_of_time(float(times[0]), usual_step(times))
+            if len(units) != 1 or not np.isfinite(times).all() or np.abs(times).max() * TIME_NS[units[0]] > LAST_S * 1e9:
+                continue
+            ahead_ns = dates - np.rint(times * TIME_NS[units[0]]).astype(np.int64)
+            zone_ns = np.rint(ahead_ns / QUARTER_NS).astype(np.int64) * QUARTER_NS
+            if np.abs(ahead_ns - zone_ns).max() < MOST_OFF_NS and 0 < np.abs(zone_ns).max() <= FARTHEST_NS:
+                columns.values[local] = dates - zone_ns
+                hours = " and ".join(f"{each / 3.6e12:+g} h" for each in np.unique(zone_ns))
+                columns.remarks.notes.append(f"{local} is in a zone of {hours} by {column!r}, and is UTC in the log")
+                break
+
+
 def _is_whole(columns: Columns, column: str) -> bool:
     """Whether a column holds whole numbers; some may be missing."""
     values = columns.values[column]
@@ -70,7 +94,10 @@ def sort_by_clock(columns: Columns) -> None:
     known = {column: np.isfinite(values.astype(float)) for column, values in columns.values.items()}
     named = {c: match for c in known if (match := re.fullmatch(TIME_OF, name_and_unit(c, "")[0] or "time"))}
     clocks = {c: known[c] for c in named if known[c].any() and goes_on(columns.values[c][known[c]])}
-    if len({len(rows) for rows in known.values()}) != 1 or not clocks or any(rows.all() for rows in clocks.values()):
+    if len({len(rows) for rows in known.values()}) != 1 or not clocks:
+        return
+    if any(rows.all() for rows in clocks.values()):
+        _cut_blocks(columns, known, clocks)
         return
     timed = np.any([*clocks.values()], axis=0)
     if any((rows & ~timed).any() for rows in known.values()):
@@ -91,6 +118,28 @@ def sort_by_clock(columns: Columns) -> None:
         _take_rows(columns, clock, rows, apart, f"{groups[clock]}/time")
         apart.units[f"{groups[clock]}/time"] = columns.units.get(clock) or name_and_unit(clock, "")[1]
     columns.remarks.notes.append(f"each of {', '.join(clocks)} is the time of the rows in which it stands")
+    columns.values, columns.units, columns.texts = apart.values, apart.units, apart.texts
+
+
+def _cut_blocks(columns: Columns, known: dict[str, np.ndarray], clocks: dict[str, np.ndarray]) -> None:
+    """Give sensors side by side, each behind its own time and some with fewer rows, their rows and a group each.
+
+    The columns of `Time (s), Acc x (g), ..., Time (s), Gyro x (deg/s), ...` become `block 1/time`, `block 1/Acc x (g)`, ....
+    """
+    if [*known][0] not in clocks or all(rows.all() for rows in clocks.values()):
+        return
+    apart, of, groups = Columns(), "", dict[str, str]()
+    for column, rows in known.items():
+        of = column if column in clocks else of
+        count = int(clocks[of].sum())
+        if rows[count:].any() or not clocks[of][:count].all():  # values without a time, or blank rows in between
+            return
+        name = "time" if column == of else column
+        groups[column] = f"block {[*clocks].index(of) + 1}/{name}"
+        _take_rows(columns, column, clocks[of], apart, groups[column])
+        if column == of:
+            apart.units[groups[column]] = columns.units.get(column) or name_and_unit(column, "")[1]
+    columns.remarks.notes.append(f"each of {', '.join(clocks)} is the time of the columns behind it, and of as many rows")
     columns.values, columns.units, columns.texts = apart.values, apart.units, apart.texts
 
 

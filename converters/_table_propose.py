@@ -20,8 +20,10 @@ from ._table_names import (
     SI_WORDS,
     WITHOUT_GRAVITY,
     group_of,
+    leaf_of,
     name_and_unit,
     spaced_name,
+    split_name,
     triples,
 )
 from ._table_text import Columns
@@ -148,8 +150,15 @@ def _triples(sensor: str, names: dict[str, tuple[str, str]], columns: Columns) -
     """Columns x, y and z that are named as a sensor's, measured ones before estimated ones."""
     plain = {column: name for column, (name, _) in names.items()}
     spaced = {column: spaced_name(column) for column in names}
-    every = [*triples(sensor, plain, spaced).values()]
+    every = [*triples(sensor, plain, spaced).values()] or _by_units(GYRO_SI if sensor == "gyro" else ACCEL_SI, names)
     return [triple for triple in every if not re.search(ESTIMATED, spaced[triple["x"]])] or every
+
+
+def _by_units(units: dict[str, float], names: dict[str, tuple[str, str]]) -> list[dict[str, str]]:
+    """Columns that are called x, y and z alone, whose units are a sensor's: `X (rad/s)`; none where there are several."""
+    leaves = {column: split_name(leaf_of(column))[0] for column, (_, unit) in names.items() if unit in units}
+    found = [(leaf, column) for column, leaf in leaves.items() if leaf in ("x", "y", "z")]
+    return [dict(found)] if sorted(leaf for leaf, _ in found) == ["x", "y", "z"] else []
 
 
 def _beside(gyros: Sequence[dict[str, str]], accels: Sequence[dict[str, str]]) -> Sequence[dict[str, str]]:

@@ -18,7 +18,7 @@ from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
-from ._table_dates import calendar_times, damaged_times, join_dates
+from ._table_dates import NO_ZONE, calendar_times, damaged_times, join_dates
 from ._table_header import header_of, note_unused_header, refuse_other_header, units_in_comments
 from ._table_names import leaf_of, tells_apart
 from ._table_numbers import (
@@ -65,6 +65,7 @@ class Columns:
     labels: dict[str, list[str]] = field(default_factory=dict)  # texts of columns that tell recordings or sensors apart
     remarks: Remarks = field(default_factory=Remarks)
     sources: dict[str, str] = field(default_factory=dict)
+    local_times: list[str] = field(default_factory=list)  # columns of dates that name no zone
     has_structures: bool = False  # whose fields follow a dot, which in the name of a plain table's column makes no group
     is_mocap: bool = False  # the poses of a motion capture, whatever the file's name
 
@@ -267,6 +268,7 @@ def _add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> Non
             columns.remarks.notes.append(f"{name}: {len(odd)} fields, as {odd[0][:40]!r}, are no numbers and count as missing")
     elif (dated := calendar_times(texts)) is not None:
         columns.values[name], columns.units[name] = dated[0], "ns"
+        columns.local_times.extend([name] if NO_ZONE in dated[1] else [])
         columns.remarks.notes.extend(f"{name}: {note}" for note in dated[1])
     elif len(set(texts)) == 1:
         columns.remarks.notes.append(f"{name} is {texts[0][:200]!r} in every row")

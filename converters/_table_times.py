@@ -91,6 +91,7 @@ def read_clocks_and_days(columns: Columns) -> None:
             if step_ns > 0.0 and SLOWEST_HZ[1] <= NS / step_ns <= PLAUSIBLE_HZ[1]:
                 columns.values[column], columns.units[column] = np.rint(days * DAY_NS).astype(np.int64), "ns"
                 columns.texts.pop(column, None)
+                columns.local_times.append(column)
                 columns.remarks.notes.append(f"{column!r} counts days as {program} does; it names no zone and counts as UTC")
 
 
