@@ -126,7 +126,7 @@ def _cut_blocks(columns: Columns, known: dict[str, np.ndarray], clocks: dict[str
 
     The columns of `Time (s), Acc x (g), ..., Time (s), Gyro x (deg/s), ...` become `block 1/time`, `block 1/Acc x (g)`, ....
     """
-    if [*known][0] not in clocks or all(rows.all() for rows in clocks.values()):
+    if next(iter(known)) not in clocks or all(rows.all() for rows in clocks.values()):
         return
     apart, of, groups = Columns(), "", dict[str, str]()
     for column, rows in known.items():
