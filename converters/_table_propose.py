@@ -42,6 +42,7 @@ RANGES = 250, 500, 1000, 2000  # deg/s, of InvenSense's gyros
 NEAR_FEET = 0.05  # share by which an acceleration may differ from gravity in ft/s^2, as one of 3.3 g in m/s^2 does
 LEAST_COUNTS = 50.0  # of gravity in whole numbers
 LONGEST_STEP_NS = 5e8  # of increments
+ROUNDING = 1e-6  # of the span of a column's values, by which a copy of it may differ
 MOST_SHOWN = 12  # triples of columns in a message
 NOTHING: Entries = {}
 
@@ -259,3 +260,32 @@ def _propose_increments(proposal: Proposal, columns: Columns) -> None:
             f'accel_scale = {rate_hz}  # with accel_unit = "m/s^2", if it holds increments of velocity (m/s)',
             f'gyro_scale = {rate_hz}  # with gyro_unit = "rad/s", if it holds increments of angle (rad)',
         ]
+
+
+def without_copies(proposals: dict[str, Proposal], columns: Columns) -> dict[str, Proposal]:
+    """IMUs without copies of another one, as of a table that joins two others; those with their own times stay."""
+    kept: dict[str, Proposal] = {}
+    by_time = sorted(proposals, key=lambda topic: not _has_own_time(proposals[topic], columns))
+    for topic in by_time:
+        own = [columns.values[c] for sensor in ("gyro", "accel") for c in proposals[topic].unsigned(sensor, columns)]
+        others = ([columns.values[c] for s in ("gyro", "accel") for c in each.unsigned(s, columns)] for each in kept.values())
+        copied = (
+            name for name, each in zip(kept, others, strict=True) if own and len(own) == len(each) == 6 and _equal(own, each)
+        )
+        if (of := next(copied, None)) is None:
+            kept[topic] = proposals[topic]
+        else:
+            columns.remarks.notes.append(f"{topic} is left out: it holds the samples of {of}")
+    return {topic: proposals[topic] for topic in proposals if topic in kept}
+
+
+def _has_own_time(proposal: Proposal, columns: Columns) -> bool:
+    """Whether the time of an IMU is in the group of its gyro."""
+    gyro = proposal.unsigned("gyro", columns)
+    return bool(gyro) and group_of(str(proposal.entries.get("time", ""))) == group_of(gyro[0])
+
+
+def _equal(own: list[np.ndarray], others: list[np.ndarray]) -> bool:
+    """Whether columns that vary are those of another sensor, but for the rounding of their texts."""
+    pairs = zip(own, others, strict=True)
+    return all(len(a) == len(b) and np.abs(a.astype(float) - b).max() < ROUNDING * np.ptp(a.astype(float)) for a, b in pairs)
