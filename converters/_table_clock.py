@@ -13,7 +13,6 @@ from ._table_text import Columns
 from ._table_times import (
     MOST_SKIPPED,
     PLAUSIBLE_HZ,
-    begun_anew,
     count_times,
     counters_of,
     counts_others,
@@ -28,6 +27,7 @@ from ._table_times import (
     usual_step,
 )
 from ._table_units import TIME_NS
+from ._table_wraps import begun_anew
 
 MOST_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
 SENSOR_TIME = r"(sensor|event|hardware|hw)_?(event_?)?(time|t_|ts|stamp)"  # Android's, beside the time of the program

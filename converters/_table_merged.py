@@ -22,6 +22,7 @@ BELOW_SECONDS = {  # names of the rest of a second in a column of its own, and i
     re.compile(r"(u|micro)s(ec(ond)?s?)?", re.IGNORECASE): 1000,
 }
 POSITIONS = r"(.*_)?(pos(e|ition)?s?|translations?|traj(ectory)?|locations?|xyz)(_.*)?"  # names of a table of positions
+MOST_UNTIMED = 0.01  # share of the rows of a table that may lack its time: a mean below them, a garbled field
 MOST_STEPS = 4.0  # median steps of positions, over which none are interpolated
 QUARTER_NS, FARTHEST_NS, MOST_OFF_NS = 900 * 10**9, 14 * 3600 * 10**9, 60 * 10**9  # of zones; between two clocks of a table
 SINCE_1970 = rf"(.*_)?{TIME_WORDS}|.*(since_?1970|epoch|unix|posix).*"
@@ -101,7 +102,11 @@ def sort_by_clock(columns: Columns) -> None:
         return
     timed = np.any([*clocks.values()], axis=0)
     if any((rows & ~timed).any() for rows in known.values()):
-        return
+        if len(clocks) > 1 or np.mean(~timed) > MOST_UNTIMED:
+            return
+        first = f"the first is row {int((~timed).argmax()) + 1}"
+        said = f"{int((~timed).sum())} rows without a number in {next(iter(clocks))!r} are left out"
+        columns.remarks.losses.append(f"{said} ({first})")
     groups = {c: named[c]["before"] or named[c]["behind"] or c for c in clocks}
     apart = Columns()
     if [*groups.values()] == [*clocks] and len(clocks) == 1:  # of one table, with blank rows

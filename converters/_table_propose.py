@@ -263,29 +263,22 @@ def _propose_increments(proposal: Proposal, columns: Columns) -> None:
 
 
 def without_copies(proposals: dict[str, Proposal], columns: Columns) -> dict[str, Proposal]:
-    """IMUs without copies of another one, as of a table that joins two others; those with their own times stay."""
-    kept: dict[str, Proposal] = {}
-    by_time = sorted(proposals, key=lambda topic: not _has_own_time(proposals[topic], columns))
-    for topic in by_time:
-        own = [columns.values[c] for sensor in ("gyro", "accel") for c in proposals[topic].unsigned(sensor, columns)]
-        others = ([columns.values[c] for s in ("gyro", "accel") for c in each.unsigned(s, columns)] for each in kept.values())
-        copied = (
-            name for name, each in zip(kept, others, strict=True) if own and len(own) == len(each) == 6 and _equal(own, each)
-        )
-        if (of := next(copied, None)) is None:
-            kept[topic] = proposals[topic]
+    """IMUs without a table's copies of the samples of other tables; those with their own times stay."""
+    kept: dict[str, list[str]] = {}
+    axes = {topic: [*each.unsigned("gyro", columns), *each.unsigned("accel", columns)] for topic, each in proposals.items()}
+    times = {topic: group_of(str(each.entries.get("time", ""))) for topic, each in proposals.items()}
+    for topic in sorted(axes, key=lambda topic: [times[topic]] != [*map(group_of, axes[topic][:1])]):
+        for other, names in kept.items():
+            tables = [{group_of(name).split("/")[0] for name in each} for each in (axes[topic], names)]
+            if not tables[0] & tables[1] and len(names) == len(axes[topic]) == 6 and _equal(columns, axes[topic], names):
+                columns.remarks.notes.append(f"{topic} is left out: it holds the samples of {other}")
+                break
         else:
-            columns.remarks.notes.append(f"{topic} is left out: it holds the samples of {of}")
-    return {topic: proposals[topic] for topic in proposals if topic in kept}
+            kept[topic] = axes[topic]
+    return {topic: each for topic, each in proposals.items() if topic in kept}
 
 
-def _has_own_time(proposal: Proposal, columns: Columns) -> bool:
-    """Whether the time of an IMU is in the group of its gyro."""
-    gyro = proposal.unsigned("gyro", columns)
-    return bool(gyro) and group_of(str(proposal.entries.get("time", ""))) == group_of(gyro[0])
-
-
-def _equal(own: list[np.ndarray], others: list[np.ndarray]) -> bool:
-    """Whether columns that vary are those of another sensor, but for the rounding of their texts."""
-    pairs = zip(own, others, strict=True)
-    return all(len(a) == len(b) and np.abs(a.astype(float) - b).max() < ROUNDING * np.ptp(a.astype(float)) for a, b in pairs)
+def _equal(columns: Columns, names: list[str], others: list[str]) -> bool:
+    """Whether columns that vary are others, but for the rounding of their texts."""
+    pairs = [(columns.values[a].astype(float), columns.values[b].astype(float)) for a, b in zip(names, others, strict=True)]
+    return all(len(a) == len(b) and np.abs(a - b).max() < ROUNDING * np.ptp(a) for a, b in pairs)
