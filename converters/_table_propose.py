@@ -263,14 +263,14 @@ def _propose_increments(proposal: Proposal, columns: Columns) -> None:
 
 
 def without_copies(proposals: dict[str, Proposal], columns: Columns) -> dict[str, Proposal]:
-    """IMUs without a table's copies of the samples of other tables; those with their own times stay."""
+    """IMUs without the copy of one of two tables, a gyro's and an accelerometer's, in a table that joins them."""
     kept: dict[str, list[str]] = {}
     axes = {topic: [*each.unsigned("gyro", columns), *each.unsigned("accel", columns)] for topic, each in proposals.items()}
-    times = {topic: group_of(str(each.entries.get("time", ""))) for topic, each in proposals.items()}
-    for topic in sorted(axes, key=lambda topic: [times[topic]] != [*map(group_of, axes[topic][:1])]):
+    tables = {topic: {group_of(name).split("/")[0] for name in names} for topic, names in axes.items()}
+    for topic in sorted(axes, key=lambda topic: -len(tables[topic])):
         for other, names in kept.items():
-            tables = [{group_of(name).split("/")[0] for name in each} for each in (axes[topic], names)]
-            if not tables[0] & tables[1] and len(names) == len(axes[topic]) == 6 and _equal(columns, axes[topic], names):
+            is_joined = len(tables[topic]) == 1 < len(tables[other]) and not tables[topic] & tables[other]
+            if is_joined and len(names) == len(axes[topic]) == 6 and _equal(columns, axes[topic], names):
                 columns.remarks.notes.append(f"{topic} is left out: it holds the samples of {other}")
                 break
         else:
