@@ -38,7 +38,7 @@ DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset;
     r"(?:(?P<year>\d{4})(?P<mark>[-/._])(?P<month>\d\d?)(?P=mark)(?P<day>\d\d?)"
     r"|(?P<first>\d\d?)(?P<sign>[./])(?P<second>\d\d?)(?P=sign)(?P<last>\d{4}))(?:[T ]+|_|--?)"
     r"(?P<clock>\d\d?(?P<colon>[:_.-])\d\d(?P=colon)\d\d)(?:(?:[.,]|(?P=colon))(?P<fraction>\d{1,9})\d*)?"
-    r" ?(?P<half>[AP]M)? ?(?P<zone>Z|UTC|[+-]\d\d(:?\d\d)?)?",
+    r" ?(?P<half>[AP]M)? ?(?P<zone>Z|UTC|GMT|[+-]\d\d(:?\d\d)?)?",
     re.IGNORECASE,
 )
 MONTHS = "jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"
