@@ -41,7 +41,7 @@ from .sensor_tables import is_phone
 MOST_TABLES = 40  # of one recording
 MOST_NAMED = 5  # of tables that are left out
 DATA_FILE = "data.hdf5"  # of RoNIN
-logger = logging.getLogger(__name__)
+logger = logging.getLogger(__package__)  # whose records `_unpacking` renames
 ENDINGS = (
     ".csv",
     ".txt",
