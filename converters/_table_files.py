@@ -19,7 +19,7 @@ from ._table_hdf5 import load_hdf5, names_of_hdf5
 from ._table_headerless import as_table, name_headerless
 from ._table_json import is_json, load_json
 from ._table_mat import check_size, load_mat, names_of_mat
-from ._table_merged import join_stamps, settle_zones, sort_by_clock
+from ._table_merged import join_calendar, join_milliseconds, join_stamps, settle_zones, sort_by_clock
 from ._table_mocap import is_mocap, read_mocap
 from ._table_motion import add_gravity
 from ._table_names import TIME_WORDS, group_of, leaf_of, split_name, tells_apart
@@ -84,6 +84,8 @@ def load(path: Path, kind: str) -> Columns:
     state_mip(columns)
     scale_stated(columns)
     join_stamps(columns)
+    join_calendar(columns)
+    join_milliseconds(columns)
     join_gps_weeks(columns)
     read_clocks_and_days(columns)
     settle_zones(columns)

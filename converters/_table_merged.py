@@ -12,7 +12,7 @@ from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_pose_names import has_turns, pose_leaves, position_of
 from ._table_sensors import SENSORS
 from ._table_text import Columns
-from ._table_times import goes_on, units_of_time, usual_step
+from ._table_times import NS, goes_on, units_of_time, usual_step
 from ._table_units import TIME_NS
 
 LAST_S = 9_223_372_036  # in the year 2262, where nanoseconds in 64 bits end
@@ -21,6 +21,18 @@ BELOW_SECONDS = {  # names of the rest of a second in a column of its own, and i
     re.compile(r"n(ano)?s(ec(ond)?s?)?", re.IGNORECASE): 1,
     re.compile(r"(u|micro)s(ec(ond)?s?)?", re.IGNORECASE): 1000,
 }
+CALENDAR = {  # names of columns that hold a part of a date or of a clock
+    "year": r"years?|yyyy",
+    "month": r"months?",
+    "day": r"days?|day_of_month",
+    "hour": r"hours?|hh|hrs?",
+    "minute": r"min(ute)?s?",
+    "second": r"sec(ond)?s?",
+}
+RANGES = {"year": (1970, 2261), "month": (1, 12), "day": (1, 31), "hour": (0, 23), "minute": (0, 59), "second": (0, 60)}
+JOINED = "time [ns]"
+MILLISECONDS = re.compile(r"(m|milli)s(ec(ond)?s?)?|millis", re.IGNORECASE)
+ALWAYS = 0.99  # share of the steps of a time that do not go back
 POSITIONS = r"(.*_)?(pos(e|ition)?s?|translations?|traj(ectory)?|locations?|xyz)(_.*)?"  # names of a table of positions
 MOST_UNTIMED = 0.01  # share of the rows of a table that may lack its time: a mean below them, a garbled field
 MOST_STEPS = 4.0  # median steps of positions, over which none are interpolated
@@ -57,6 +69,59 @@ def join_stamps(columns: Columns) -> None:
             for row, t in zip(np.flatnonzero(known).tolist(), t_ns.tolist(), strict=True):
                 texts[row] = str(t)
             columns.texts[name] = texts
+
+
+def join_calendar(columns: Columns) -> None:
+    """Make one column of the hour, the minute and the second in columns of their own, and of the date in three others."""
+    named = {split_name(column)[0]: column for column in columns.values}
+    found = {part: next((named[n] for n in named if re.fullmatch(pattern, n)), "") for part, pattern in CALENDAR.items()}
+    has_date = all(map(found.get, ("year", "month", "day")))
+    wanted = [part for part in CALENDAR if has_date or part in ("hour", "minute", "second")]
+    if not all(map(found.get, wanted)) or "time" in named:
+        return
+    values = {part: columns.values[found[part]].astype(float) for part in wanted}
+    fits = [np.all((each >= RANGES[part][0]) & (each <= RANGES[part][1])) for part, each in values.items()]  # NaN fits none
+    if not all(fits) or len({*map(len, values.values())}) != 1:
+        return
+    t_ns = np.rint((values["hour"] * 3600.0 + values["minute"] * 60.0 + values["second"]) * NS).astype(np.int64)
+    if has_date:
+        months = ((values["year"] - 1970) * 12 + values["month"] - 1).astype(np.int64).astype("M8[M]")
+        t_ns += (months.astype("M8[D]").astype(np.int64) + values["day"].astype(np.int64) - 1) * 86_400 * NS
+    for part in wanted:
+        del columns.values[found[part]]
+        columns.texts.pop(found[part], None)
+    columns.values, columns.units[JOINED] = {JOINED: t_ns, **columns.values}, "ns"
+    columns.local_times.append(JOINED)
+    said = ", ".join(repr(found[part]) for part in wanted)
+    columns.remarks.notes.append(f"{said} are one time, which names no zone and counts as UTC")
+
+
+def join_milliseconds(columns: Columns) -> None:
+    """Give a time in whole seconds, a date or a number, the milliseconds that stand in a column of their own.
+
+    They are those of the second, or count from a start and lead up within the same second in each row.
+    """
+    counts = {c: values.astype(np.int64) for c, values in columns.values.items() if values.dtype.kind in "iu"}
+    spelled = {c: name_and_unit(c, columns.units.get(c, "")) for c in counts}
+    parts = [c for c in counts if MILLISECONDS.fullmatch(c) or spelled[c] == ("time", "ms")]
+    for part, column in product(parts, counts):
+        (name, unit), seconds, ns = spelled[column], counts[column], counts[part] * 1_000_000
+        size = {"ns": 1, "s": NS, "": NS}.get(unit, 0)
+        is_time = part != column and size and re.fullmatch(rf"(.*_)?{TIME_WORDS}|sec(ond)?s?", name or unit)
+        if not is_time or not len(seconds) == len(ns) > 1 or not 0 < seconds.max() <= LAST_S * NS // size:
+            continue
+        t_ns = seconds * size
+        if (t_ns % NS).any():
+            continue
+        start = t_ns - ns
+        if 0 <= ns.min() <= ns.max() < NS:
+            t_ns = t_ns + ns
+        elif MILLISECONDS.fullmatch(part) and start.max() < start.min() + NS:
+            t_ns = ns + start.max()
+        if np.mean(np.diff(t_ns) >= 0) >= ALWAYS and np.mean(np.diff(t_ns) > 0) > np.mean(np.diff(seconds) > 0):
+            columns.values[column], columns.units[column] = t_ns, "ns"
+            columns.texts.pop(column, None)
+            columns.remarks.notes.append(f"{part!r} holds the milliseconds of {column!r}")
 
 
 def settle_zones(columns: Columns) -> None:

@@ -164,3 +164,31 @@ def test_sensors_side_by_side_have_the_rows_of_their_own_times(tmp_path: Path, n
     np.testing.assert_array_equal(imu.t_ns, T_NS[::step][: len(imu)])
     np.testing.assert_array_equal(imu.gyro, GYRO[::step][: len(imu)])
     np.testing.assert_allclose(imu.accel[::2], ACCEL[:: 2 * step][: len(imu.accel[::2])], rtol=1e-12)
+
+
+PARTS = {  # of a time, and what they are where they are one
+    "seconds and milliseconds": ("{s},{ms}", "seconds,milliseconds", 0),
+    "two times": ("{s},{ms}", "time_s,time_ms", 0),
+    "a date and milliseconds": ("{date},{ms}", "Timestamp,Milliseconds", 0),
+    "a date and milliseconds since the start": ("{date},{all}", "Timestamp,Milliseconds", 0),
+    "a clock and a date": ("{y},{m},{d},{H},{M},{S},{ms}", "year,month,day,hour,minute,second,millisecond", 0),
+    "a clock": ("{H},{M},{S},{ms}", "hour,min,sec,msec", 20_405 * 86_400 * 10**9),
+}
+
+
+@pytest.mark.parametrize("form", PARTS)
+def test_a_time_in_parts_keeps_its_milliseconds_and_its_gaps(tmp_path: Path, form: str) -> None:
+    row, header, day_ns = PARTS[form]
+    kept = np.setdiff1d(np.arange(COUNT), np.arange(130, 170))
+    t_ns = (1_763_078_399_600_000_000 + T_NS)[kept]  # midnight is 400 ms later
+    fields = []
+    for t in t_ns.tolist():
+        at = datetime.fromtimestamp(t // 10**9, UTC)
+        clock = {"y": at.year, "m": at.month, "d": at.day, "H": at.hour, "M": at.minute, "S": at.second}
+        ms = {"ms": t // 10**6 % 1000, "all": (t - t_ns[0]) // 10**6}
+        fields.append(row.format(s=t // 10**9, date=at.strftime("%Y-%m-%d %H:%M:%S"), **clock, **ms))
+    rows = lines(np.array(fields), GYRO[kept], ACCEL[kept])
+    (tmp_path / "log.csv").write_text("\n".join([f"{header},gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path / "log.csv")[0], mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_array_equal(log.imus["/imu0"].t_ns, t_ns - day_ns)
+    assert not any("share the stamp" in note for note in log.remarks.notes)
