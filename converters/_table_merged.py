@@ -72,7 +72,7 @@ def join_stamps(columns: Columns) -> None:
 
 
 def join_calendar(columns: Columns) -> None:
-    """Make one column of the hour, the minute and the second in columns of their own, and of the date in three others."""
+    """Make one time of an hour, a minute, a second, and perhaps a date, in columns of their own."""
     named = {split_name(column)[0]: column for column in columns.values}
     found = {part: next((named[n] for n in named if re.fullmatch(pattern, n)), "") for part, pattern in CALENDAR.items()}
     has_date = all(map(found.get, ("year", "month", "day")))
@@ -97,7 +97,7 @@ def join_calendar(columns: Columns) -> None:
 
 
 def join_milliseconds(columns: Columns) -> None:
-    """Give a time in whole seconds, a date or a number, the milliseconds that stand in a column of their own.
+    """Give a time in whole seconds the milliseconds that stand in a column of their own.
 
     They are those of the second, or count from a start and lead up within the same second in each row.
     """
@@ -125,7 +125,7 @@ def join_milliseconds(columns: Columns) -> None:
 
 
 def settle_zones(columns: Columns) -> None:
-    """Take the zone of dates that name none from a time since 1970 beside them; summer time may end among them."""
+    """Take the zone of dates that name none from a time since 1970 beside them, row by row."""
     for local in columns.local_times:
         dates = columns.values[local]
         for column, values in columns.values.items():
@@ -192,7 +192,7 @@ def sort_by_clock(columns: Columns) -> None:
 
 
 def _cut_blocks(columns: Columns, known: dict[str, np.ndarray], clocks: dict[str, np.ndarray]) -> None:
-    """Give sensors side by side, each behind its own time and some with fewer rows, their rows and a group each.
+    """Give sensors side by side, each behind its own time, their rows and a group each.
 
     The columns of `Time (s), Acc x (g), ..., Time (s), Gyro x (deg/s), ...` become `block 1/time`, `block 1/Acc x (g)`, ....
     """

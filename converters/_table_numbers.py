@@ -98,7 +98,7 @@ def decimal_points(texts: list[str], mark: re.Pattern[str]) -> list[str]:
 
 
 def without_thousands(lines: list[str], delimiter: str | None) -> tuple[list[str], list[int]]:
-    """Rows without the points that mark thousands beside decimal commas, as in 1.234,5; and the places of such columns."""
+    """Rows without points that mark thousands, and the places of their columns."""
     if delimiter == "," or not any(
         COMMA_NUMBER.fullmatch(text) for row in fields_of(lines[:SAMPLED], delimiter) for text in row
     ):

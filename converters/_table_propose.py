@@ -156,7 +156,7 @@ def _triples(sensor: str, names: dict[str, tuple[str, str]], columns: Columns) -
 
 
 def _by_units(units: dict[str, float], names: dict[str, tuple[str, str]]) -> list[dict[str, str]]:
-    """Columns that are called x, y and z alone, whose units are a sensor's: `X (rad/s)`; none where there are several."""
+    """Columns x, y and z alone, whose units are a sensor's: `X (rad/s)`; none of several."""
     leaves = {column: split_name(leaf_of(column))[0] for column, (_, unit) in names.items() if unit in units}
     found = [(leaf, column) for column, leaf in leaves.items() if leaf in ("x", "y", "z")]
     return [dict(found)] if sorted(leaf for leaf, _ in found) == ["x", "y", "z"] else []
@@ -263,7 +263,7 @@ def _propose_increments(proposal: Proposal, columns: Columns) -> None:
 
 
 def without_copies(proposals: dict[str, Proposal], columns: Columns) -> dict[str, Proposal]:
-    """IMUs without the copy of one of two tables, a gyro's and an accelerometer's, in a table that joins them."""
+    """IMUs without the copy in a table that joins those of a gyro and an accelerometer."""
     kept: dict[str, list[str]] = {}
     axes = {topic: [*each.unsigned("gyro", columns), *each.unsigned("accel", columns)] for topic, each in proposals.items()}
     tables = {topic: {group_of(name).split("/")[0] for name in names} for topic, names in axes.items()}

@@ -1,4 +1,4 @@
-"""Times in nanoseconds, and those that begin again: at the end of their range, or with the next recording."""
+"""Times in nanoseconds, and those that begin again, at an end or with a recording."""
 
 from __future__ import annotations
 
@@ -66,12 +66,14 @@ def unwrapped(counts: np.ndarray) -> Float64[np.ndarray, " n"]:
 
 
 def without_ends(t_ns: Int64[np.ndarray, " n"], unit_ns: int, name: str, notes: list[str]) -> Int64[np.ndarray, " n"]:
-    """Times that go on where they begin again: at a power of two of their unit, each second, minute, hour, day or GPS week.
+    """Times that go on where they begin again.
 
-    There the time falls by about the whole range, and goes on with a usual step. At 2^32 samples may be missing.
+    That is at a power of two of their unit, each second, minute, hour, day or GPS week. There the time falls by about the whole
+    range, and goes on with a usual step. At 2^32 samples may be missing.
     """
     steps = np.diff(t_ns)
-    ends = {f"2^{size.bit_length() - 1}": size * unit_ns for size in ENDS} | {f"{s} s": s * 10**9 for s in ENDS_S}
+    words = {f"2^{size.bit_length() - 1}": size * unit_ns for size in ENDS if size * unit_ns <= LAST_NS}
+    ends = words | {f"{s} s": s * 10**9 for s in ENDS_S}
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     for said, size in ends.items() if (steps < 0).any() else ():
         falls = steps < -MOST_OF_WORD * size
@@ -81,5 +83,6 @@ def without_ends(t_ns: Int64[np.ndarray, " n"], unit_ns: int, name: str, notes: 
         if falls.any() and fits and np.ptp(t_ns) < size and (is_word or (gaps.min() > 0 and gaps.max() <= MOST_STEPS * usual)):
             note = f"{name!r} begins again at {said} ({int(falls.sum())} times): its times go on there"
             notes += [note] if note not in notes else []
-            return t_ns + size * np.concatenate([[0], np.cumsum(falls)])
+            t_ns[1:] += size * np.cumsum(falls)
+            return t_ns
     return t_ns

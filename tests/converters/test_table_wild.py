@@ -881,12 +881,13 @@ def test_a_counter_of_32_bits_goes_on_where_it_begins_again(tmp_path):
         ("ms", 1000, 0, "1 s"),
         ("s", 86_400.0, 86_399.0, "86400 s"),
         ("s", 604_800.0, 604_799.0, "604800 s"),
+        ("min", 60.0, 59.99, "3600 s"),
     ],
 )
 def test_a_time_goes_on_where_it_begins_again(tmp_path, unit, size, first, said):
     names = [f"time ({unit})", *(f"acc_{a} [g]" for a in "xyz"), *(f"gyro_{a} [deg/s]" for a in "xyz")]
-    ns = {"us": 1000, "ms": 10**6, "s": 10**9}[unit]
-    t = first + np.round(T_S * 1e9 / ns, 2).astype(type(size))
+    ns = {"us": 1000, "ms": 10**6, "s": 10**9, "min": 60 * 10**9}[unit]
+    t = first + np.round(T_S * 1e9 / ns, 9).astype(type(size))
     low = -(2**31) if first == 2**31 - 1_000_000 else 0
     log = read(write_csv(tmp_path / "imu.csv", names, [(t - low) % size + low, *ACCEL_G.T, *COUNTS.T]))
     np.testing.assert_allclose(log.imus["/imu0"].t_ns, t.astype(float) * ns, rtol=0.0, atol=1000)
