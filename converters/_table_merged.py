@@ -37,6 +37,7 @@ POSITIONS = r"(.*_)?(pos(e|ition)?s?|translations?|traj(ectory)?|locations?|xyz)
 MOST_UNTIMED = 0.01  # share of the rows of a table that may lack its time: a mean below them, a garbled field
 MOST_STEPS = 4.0  # median steps of positions, over which none are interpolated
 QUARTER_NS, FARTHEST_NS, MOST_OFF_NS = 900 * 10**9, 14 * 3600 * 10**9, 60 * 10**9  # of zones; between two clocks of a table
+SINCE_NS = 10**18  # in 2001; smaller times may count from any start
 SINCE_1970 = rf"(.*_)?{TIME_WORDS}|.*(since_?1970|epoch|unix|posix).*"
 TIME_OF = rf"((?P<before>.+?)_)?{TIME_WORDS}|{TIME_WORDS}_(?P<behind>.+)"  # imu_time, time_gps
 
@@ -91,7 +92,7 @@ def join_calendar(columns: Columns) -> None:
         del columns.values[found[part]]
         columns.texts.pop(found[part], None)
     columns.values, columns.units[JOINED] = {JOINED: t_ns, **columns.values}, "ns"
-    columns.local_times.append(JOINED)
+    columns.local_times.extend([JOINED] if has_date else [])
     said = ", ".join(repr(found[part]) for part in wanted)
     columns.remarks.notes.append(f"{said} are one time, which names no zone and counts as UTC")
 
@@ -134,9 +135,10 @@ def settle_zones(columns: Columns) -> None:
                 continue
             times = values.astype(float)
             units = [unit] if unit in TIME_NS else units_of_time(float(times[0]), usual_step(times))
-            if len(units) != 1 or not np.isfinite(times).all() or np.abs(times).max() * TIME_NS[units[0]] > LAST_S * 1e9:
+            times = times * TIME_NS[units[0]] if len(units) == 1 else np.zeros(len(times))
+            if not SINCE_NS < times.min() <= times.max() < LAST_S * NS:
                 continue
-            ahead_ns = dates - np.rint(times * TIME_NS[units[0]]).astype(np.int64)
+            ahead_ns = dates - np.rint(times).astype(np.int64)
             zone_ns = np.rint(ahead_ns / QUARTER_NS).astype(np.int64) * QUARTER_NS
             if np.abs(ahead_ns - zone_ns).max() < MOST_OFF_NS and 0 < np.abs(zone_ns).max() <= FARTHEST_NS:
                 columns.values[local] = dates - zone_ns

@@ -192,3 +192,11 @@ def test_a_time_in_parts_keeps_its_milliseconds_and_its_gaps(tmp_path: Path, for
     log = table.read_sequence(table.sequences(tmp_path / "log.csv")[0], mapping={"gyro_unit": "rad/s"})
     np.testing.assert_array_equal(log.imus["/imu0"].t_ns, t_ns - day_ns)
     assert not any("share the stamp" in note for note in log.remarks.notes)
+
+
+def test_a_time_since_a_start_is_no_zone_of_a_clock(tmp_path: Path) -> None:
+    rows = lines(np.array([f"10,0,{t // 10**9},{t / 1e9}" for t in T_NS.tolist()]), GYRO, ACCEL)
+    (tmp_path / "log.csv").write_text("\n".join(["hour,minute,second,elapsed_time (s),gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path)[0], mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_array_equal(log.imus["/imu0"].t_ns, T_NS)
+    assert not any("zone of" in note for note in log.remarks.notes)
