@@ -68,8 +68,9 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
         proposal.reasons += [f"{c!r} rises and has {len(columns.values[c])} rows, and the gyro {length}" for c in others]
         for column in still:
             values = columns.values[column]
-            counts = f"{len(np.unique(values))} different values in {len(values)} rows"
-            proposal.reasons.append(f"{column!r} is named as a time and does not rise: {counts}")
+            counts = f"does not rise: {len(np.unique(values))} different values in {len(values)} rows"
+            falls = "falls from row to row: sort the rows by it"
+            proposal.reasons.append(f"{column!r} is named as a time and {falls if rises(values[::-1]) else counts}")
             proposal.hints += rate_of_rows(column, values, columns.units.get(column, "") or names[column][1])
         _propose_rate(proposal, columns, next(iter(counters), ""), length)
         return

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from imutool.converters import table
+from imutool.errors import ConfigError
 
 COUNT, LATE_MS = 1000, 3
 GYRO = np.random.default_rng(8).normal(0.0, 0.1, (COUNT, 3))
@@ -200,3 +201,10 @@ def test_a_time_since_a_start_is_no_zone_of_a_clock(tmp_path: Path) -> None:
     log = table.read_sequence(table.sequences(tmp_path)[0], mapping={"gyro_unit": "rad/s"})
     np.testing.assert_array_equal(log.imus["/imu0"].t_ns, T_NS)
     assert not any("zone of" in note for note in log.remarks.notes)
+
+
+def test_rows_with_the_newest_first_are_to_be_sorted(tmp_path: Path) -> None:
+    rows = lines(T_NS // 1_000_000, GYRO, ACCEL)[::-1]
+    (tmp_path / "log.csv").write_text("\n".join(["time_ms,gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    with pytest.raises(ConfigError, match="'time_ms' is named as a time and falls from row to row: sort the rows by it"):
+        table.read_sequence(table.sequences(tmp_path / "log.csv")[0], mapping={"gyro_unit": "rad/s"})
