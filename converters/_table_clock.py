@@ -13,7 +13,6 @@ from ._table_text import Columns
 from ._table_times import (
     MOST_SKIPPED,
     PLAUSIBLE_HZ,
-    begun_anew,
     count_times,
     counters_of,
     counts_others,
@@ -28,6 +27,7 @@ from ._table_times import (
     usual_step,
 )
 from ._table_units import TIME_NS
+from ._table_wraps import begun_anew
 
 MOST_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
 SENSOR_TIME = r"(sensor|event|hardware|hw)_?(event_?)?(time|t_|ts|stamp)"  # Android's, beside the time of the program
@@ -68,8 +68,9 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
         proposal.reasons += [f"{c!r} rises and has {len(columns.values[c])} rows, and the gyro {length}" for c in others]
         for column in still:
             values = columns.values[column]
-            counts = f"{len(np.unique(values))} different values in {len(values)} rows"
-            proposal.reasons.append(f"{column!r} is named as a time and does not rise: {counts}")
+            counts = f"does not rise: {len(np.unique(values))} different values in {len(values)} rows"
+            falls = "falls from row to row: sort the rows by it"
+            proposal.reasons.append(f"{column!r} is named as a time and {falls if rises(values[::-1]) else counts}")
             proposal.hints += rate_of_rows(column, values, columns.units.get(column, "") or names[column][1])
         _propose_rate(proposal, columns, next(iter(counters), ""), length)
         return

@@ -30,6 +30,7 @@ LEAP_SECONDS = (  # by which GPS is ahead of UTC, since then
 PARTS_OF_SECOND = 1, 10, 100, 1000, 10**6  # behind hhmmss, without a point
 LONGEST_END_NS = 20 * 10**9  # step across the end of a minute that shows it; numbers that only count step by 40 s there
 LONGEST_STEP_NS = 2 * 10**9  # in the mean; 0, 50, 100, 150, ... would be 0:00, 0:50, 1:00, 1:50
+NO_ZONE = "its times name no zone and count as UTC"
 DAYTIME = r"\d\d?:\d\d:\d\d([.,]\d+)?( ?[ap]m)?"
 SPANS = "elapsed|duration|relative|since"  # in the name of a column of times that are none of the day
 DAY = r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([./])\d\d?\2\d{4}"
@@ -37,7 +38,7 @@ DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset;
     r"(?:(?P<year>\d{4})(?P<mark>[-/._])(?P<month>\d\d?)(?P=mark)(?P<day>\d\d?)"
     r"|(?P<first>\d\d?)(?P<sign>[./])(?P<second>\d\d?)(?P=sign)(?P<last>\d{4}))(?:[T ]+|_|--?)"
     r"(?P<clock>\d\d?(?P<colon>[:_.-])\d\d(?P=colon)\d\d)(?:(?:[.,]|(?P=colon))(?P<fraction>\d{1,9})\d*)?"
-    r" ?(?P<half>[AP]M)? ?(?P<zone>Z|UTC|[+-]\d\d(:?\d\d)?)?",
+    r" ?(?P<half>[AP]M)? ?(?P<zone>Z|UTC|GMT|[+-]\d\d(:?\d\d)?)?",
     re.IGNORECASE,
 )
 MONTHS = "jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"
@@ -78,7 +79,7 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
         stamps.append(seconds * 10**9 + int((match["fraction"] or "0").ljust(9, "0")))
     if not 0 <= min(stamps) <= max(stamps) <= LAST_NS:
         return None
-    notes = [] if matches[0] is None or matches[0]["zone"] else ["its times name no zone and count as UTC"]
+    notes = [] if matches[0] is None or matches[0]["zone"] else [NO_ZONE]
     if slashes:
         notes.append(f"its dates count as {'day/month' if day_first else 'month/day'}/year")
     return np.array(stamps, np.int64), notes

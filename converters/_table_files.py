@@ -19,16 +19,17 @@ from ._table_hdf5 import load_hdf5, names_of_hdf5
 from ._table_headerless import as_table, name_headerless
 from ._table_json import is_json, load_json
 from ._table_mat import check_size, load_mat, names_of_mat
-from ._table_merged import join_stamps, sort_by_clock
+from ._table_merged import join_calendar, join_milliseconds, join_stamps, settle_zones, sort_by_clock
 from ._table_mocap import is_mocap, read_mocap
 from ._table_motion import add_gravity
 from ._table_names import TIME_WORDS, group_of, leaf_of, split_name, tells_apart
 from ._table_numbers import is_number
+from ._table_numpy import load_npy, load_npz
 from ._table_packed import goes_back, read_bytes, text_head
 from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated, state_mip
 from ._table_sensors import read_rows
 from ._table_sheets import load_sheets
-from ._table_text import FIRSTS, WIDEST, Columns, is_text_table, read_csv, text_of
+from ._table_text import FIRSTS, Columns, add_fields, is_text_table, read_csv, text_of
 from ._table_times import join_gps_weeks, read_clocks_and_days
 
 NO_NUMBERS = "holds no columns of numbers"
@@ -42,7 +43,7 @@ MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own
 MAT = (b"\x00\x01IM", b"\x01\x00MI")  # version 5 and the order of bytes, behind a text that is the writing program's own
 MAT_AT = slice(124, 128)
 ZIP = b"PK\x03\x04"
-NUMBERS = r"u?int|float|double|halffloat|bool|timestamp|duration|dict"  # names of types of Arrow
+NUMBERS = r"u?int|float|double|halffloat|bool|timestamp|duration|time\d\d|dict"  # names of types of Arrow
 VECTORS = r"(large_|fixed_size_)?list<\w+: (u?int|float|double|halffloat)"
 SHEETS = {"xl/workbook.xml": "sheets", "xl/workbook.bin": "other sheets", "content.xml": "other sheets"}  # members of a zip
 
@@ -83,8 +84,11 @@ def load(path: Path, kind: str) -> Columns:
     state_mip(columns)
     scale_stated(columns)
     join_stamps(columns)
+    join_calendar(columns)
+    join_milliseconds(columns)
     join_gps_weeks(columns)
     read_clocks_and_days(columns)
+    settle_zones(columns)
     sort_by_clock(columns)
     add_gravity(columns)
     if not columns.values:
@@ -111,7 +115,8 @@ def _times_fall(path: Path, names: list[str]) -> bool:
     times = [name for name in names if re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(name)[0])]
     with refusing(path):
         columns = _module("pyarrow.parquet", path).read_table(path, columns=times).columns if times else []
-    values = [column.to_numpy() for column in columns if re.match(NUMBERS, str(column.type)) and not column.null_count]
+    plain = (column for column in columns if re.match(NUMBERS, str(column.type)) and not column.null_count)
+    values = [column.cast("int64" if re.match(r"time\d\d", str(column.type)) else column.type).to_numpy() for column in plain]
     return any((np.diff(each.astype(np.int64 if each.dtype.kind == "M" else float)) < 0).any() for each in values)
 
 
@@ -190,7 +195,8 @@ def _load_feather(path: Path, columns: Columns) -> None:
 def _numbers_of(schema: Any, columns: Columns) -> list[str]:
     """Names of the fields that hold numbers or times, also in lists and structures; the others are losses."""
     numbers = [f.name for f in schema if re.match(rf"{NUMBERS}|{VECTORS}|struct", str(f.type))]
-    words = [f.name for f in schema if re.match(r"large_string|string", str(f.type)) and tells_apart(f.name)]
+    texts = [f.name for f in schema if re.match(r"large_string|string", str(f.type))]
+    words = [name for name in texts if tells_apart(name) or re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(name)[0])]
     others = [field for field in schema if field.name not in (*numbers, *words)]
     columns.remarks.losses.extend(f"{field.name} is left out: it is of type {field.type}, no number" for field in others)
     return numbers + words
@@ -214,60 +220,14 @@ def _add_arrow(table: Any, columns: Columns) -> None:
             else:
                 columns.remarks.losses.append(f"{name} is left out: its lists differ in length, or are empty")
             continue
-        if times := re.match("timestamp|duration", str(column.type)):
-            columns.add(f"{name} [ns]", column.cast(f"{times[0]}[ns]").cast("int64").to_numpy())
+        if times := re.match(r"timestamp|duration|time\d\d", str(column.type)):
+            kind = times[0].replace("time32", "time64")
+            columns.add(f"{name} [ns]", column.cast(f"{kind}[ns]").cast("int64").to_numpy())
+            columns.local_times.extend([] if getattr(column.type, "tz", None) else [f"{name} [ns]"])
         elif "string" in str(column.type):
-            columns.add_labels(name, [str(text or "") for text in column.to_pylist()])
+            add_fields(columns, name, [str(text or "") for text in column.to_pylist()], "")
         else:
             columns.add(name, column.to_numpy())
-
-
-def _load_npz(path: Path, columns: Columns) -> None:
-    with zipfile.ZipFile(path) as archive:
-        for info in archive.infolist():
-            with archive.open(info) as member:  # the size that the array states, whatever the archive says
-                shape = npy_shape(member) if info.filename.endswith(".npy") else ()
-            check_size(path, max(info.file_size, 8 * int(np.prod(shape, dtype=float))))
-        check_size(path, sum(info.file_size for info in archive.infolist()))
-    with np.load(path, allow_pickle=False) as arrays:
-        for name in arrays.files:
-            columns.add(name, arrays[name])
-
-
-def _load_npy(path: Path, columns: Columns) -> None:
-    """One array, whose columns have no names unless its type states them."""
-    array = read_npy(path)
-    if array.dtype.names:
-        for name in array.dtype.names:
-            columns.add(name, array[name])
-        return
-    if array.ndim == 2 and array.shape[0] < array.shape[1]:
-        array = array.T
-    for number, column in enumerate(np.atleast_2d(array.T) if array.ndim in (1, 2) else [], 1):
-        if number <= WIDEST:
-            columns.add(f"column {number}", column)
-    name_headerless(columns)
-
-
-def read_npy(path: Path) -> np.ndarray:
-    """Array of a .npy.
-
-    Raises:
-        DataError: larger than a table may be.
-        ValueError: damaged, or of Python's objects.
-    """
-    with path.open("rb") as file:
-        check_size(path, 8 * int(np.prod(npy_shape(file), dtype=float)))
-    array: np.ndarray = np.load(path, allow_pickle=False)
-    return array
-
-
-def npy_shape(member: Any) -> tuple[int, ...]:
-    """Shape of the array that an open .npy states."""
-    version = np.lib.format.read_magic(member)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape: tuple[int, ...] = read(member)[0]
-    return shape
 
 
 def _refuse_sheets(path: Path, columns: Columns) -> None:
@@ -289,8 +249,8 @@ LOADERS: dict[str, Callable[[Path, Columns], None]] = {
     "json": load_json,
     "parquet": _load_parquet,
     "feather": _load_feather,
-    "npz": _load_npz,
-    "npy": _load_npy,
+    "npz": load_npz,
+    "npy": load_npy,
     "mat": load_mat,
     "hdf5": load_hdf5,
     "sheets": lambda path, columns: load_sheets(path, columns, read_text),

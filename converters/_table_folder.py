@@ -22,13 +22,14 @@ from imutool.errors import DataError
 from . import Sequence
 from ._archive import refusing
 from ._source import find_folders, head
-from ._table_files import kind_of, load, npy_shape, read_npy
+from ._table_files import kind_of, load
 from ._table_geodetic import add_local
 from ._table_header import MOSTLY
 from ._table_look import look, recorded_apart
 from ._table_map import POSES_GROUP, TRUTH_GROUP
 from ._table_merged import join_positions
 from ._table_names import TIME_WORDS, name_and_unit, split_name
+from ._table_numpy import npy_shape, read_npy
 from ._table_packed import read_bytes, table_name
 from ._table_roles import POSES, Names, role_folders, role_groups, shared_names, without_role
 from ._table_sensors import SENSORS, SPACED, name_columns, sensors_among
@@ -40,7 +41,7 @@ from .sensor_tables import is_phone
 MOST_TABLES = 40  # of one recording
 MOST_NAMED = 5  # of tables that are left out
 DATA_FILE = "data.hdf5"  # of RoNIN
-logger = logging.getLogger(__name__)
+logger = logging.getLogger(__package__)  # whose records `_unpacking` renames
 ENDINGS = (
     ".csv",
     ".txt",

@@ -105,8 +105,9 @@ def _measured(node: Any) -> Any:
     lacking = [stated[key] for key in FILLS if key in stated]
     if lacking and (rows := np.isin(values, lacking)).any():
         values = np.where(rows, np.nan, values)
-    if {"scale_factor", "add_offset"} & stated.keys():
-        values = values * float(stated.get("scale_factor", 1.0)) + float(stated.get("add_offset", 0.0))
+    scale = stated.get("scale_factor", stated.get("scale", 1.0) if node.dtype.kind in "iu" else 1.0)  # of counts
+    if scale != 1.0 or "add_offset" in stated:
+        values = values * float(scale) + float(stated.get("add_offset", 0.0))
     return values
 
 

@@ -19,10 +19,12 @@ import numpy as np
 
 from imutool.errors import DataError
 
+from ._table_dates import calendar_times
 from ._table_headerless import name_headerless
+from ._table_numbers import numbers
 from ._table_packed import read_bytes
 from ._table_sensors import name_columns, read_rows, sensors_among
-from ._table_text import Columns, read_csv
+from ._table_text import Columns, add_fields, read_csv
 
 START = re.compile(r'\s*(\{\s*"|\[\s*(\{\s*"|\[|-?\d+(\.\d+)?([eE][-+]?\d+)?\s*,))')
 NEXT = re.compile(rb"\}\s*\{")  # an object behind another, without a comma
@@ -52,6 +54,8 @@ def load_json(path: Path, columns: Columns) -> None:
         if isinstance(node, list) and isinstance(node[0], dict):
             for kind, rows in _kinds(node).items():
                 tables["/".join(filter(None, (name, kind)))] = rows
+        elif isinstance(node, list) and isinstance(node[0], str) and (calendar_times(node) or numbers(node)):
+            add_fields(columns, name, node, "")
         elif isinstance(node, list):
             columns.add(name, node if isinstance(node[0], str) else _numbers(node))
         else:
@@ -112,7 +116,10 @@ def _value(raw: bytes) -> Any:
 
 
 def _nodes(node: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """Arrays and single numbers of a document, with dotted names."""
+    """Arrays and single numbers of a document, with dotted names; rows by their numbers, as of pandas, are an array."""
+    if isinstance(node, dict) and len(node) >= LEAST_ROWS and next(iter(node)) in ("0", "1"):
+        first = int(next(iter(node)))
+        node = [*node.values()] if [*node] == [str(n) for n in range(first, first + len(node))] else node
     if isinstance(node, dict):
         for key, child in node.items():
             inner = f"{name}.{key}" if name else str(key)

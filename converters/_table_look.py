@@ -29,7 +29,7 @@ NARROW = 2  # numbers in a row of a time and a reading
 LEAST_VECTOR = 3  # numbers in a row of a sensor
 MOST_LARGER = 1.2  # ratio of the sizes of files, or of the times, of IMUs that were recorded together
 SINCE_1970_NS = 10**18  # in 2001; smaller times may count from any start
-logger = logging.getLogger(__name__)
+logger = logging.getLogger(__package__)  # whose records `_unpacking` renames
 
 
 def _start(path: Path, kind: str) -> str:

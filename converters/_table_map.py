@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +15,15 @@ import msgspec
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.errors import ConfigError, DataError, did_you_mean
+from imutool.errors import ConfigError, did_you_mean
 from imutool.recording.message_log import KINDS
 
 from ._table_text import Columns
-from ._table_times import COUNTED, without_overflow
+from ._table_times import COUNTED
 from ._table_units import TIME_NS, UNITS_OF
+from ._table_wraps import stamps, without_ends
 
 IMU_TOPIC = "/imu0"
-LARGEST_NS = 2**63 - 1
 WORLDS = ("ned",)
 LISTS = {  # entries that name several columns
     **dict.fromkeys(("gyro", "accel", "position"), (3, "x, y, z")),
@@ -259,26 +258,15 @@ def column_named(columns: Columns, wanted: str, where: Path | str) -> np.ndarray
 
 
 def times_named(columns: Columns, wanted: str, unit: str, where: Path) -> Int64[np.ndarray, " n"]:
-    """Stamps in nanoseconds; decimals of a text file are exact.
+    """Stamps in nanoseconds, which go on where a clock begins again.
 
     Raises:
         ConfigError: there is no such column.
         DataError: no numbers, or beyond the year 2262.
     """
-    values = column_named(columns, wanted, where)
-    size = TIME_NS[unit]
-    if values.dtype.kind in "iu":
-        if len(values) and int(values.max()) > LARGEST_NS // int(size):
-            raise DataError(f"{wanted} reaches {values.max()} {unit}", where=where, expected="a time before the year 2262")
-        return without_overflow(values, wanted, columns.remarks.notes) * int(size)
-    if (texts := columns.texts.get(wanted)) is not None:
-        try:
-            return np.array([int((Decimal(text) * int(size)).to_integral_value()) for text in texts], np.int64)
-        except (InvalidOperation, OverflowError, ValueError):
-            pass
-    if not np.isfinite(values).all() or np.abs(values).max() * size > LARGEST_NS:
-        raise DataError(f"{wanted} holds times that are no numbers, or beyond the year 2262", where=where)
-    return np.rint(values.astype(np.float64) * size).astype(np.int64)
+    values, unit_ns = column_named(columns, wanted, where), int(TIME_NS[unit])
+    t_ns = stamps(values, columns.texts.get(wanted), unit_ns, f"{where}: {wanted}")
+    return without_ends(t_ns, unit_ns, wanted, columns.remarks.notes)
 
 
 def vectors_named(

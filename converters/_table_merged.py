@@ -12,7 +12,8 @@ from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_pose_names import has_turns, pose_leaves, position_of
 from ._table_sensors import SENSORS
 from ._table_text import Columns
-from ._table_times import goes_on
+from ._table_times import NS, goes_on, units_of_time, usual_step
+from ._table_units import TIME_NS
 
 LAST_S = 9_223_372_036  # in the year 2262, where nanoseconds in 64 bits end
 SECONDS = re.compile(r"(.*?)(?:secs?|seconds?|(?:unix|utc|posix)[ _]?time)(_\w+)?", re.IGNORECASE)
@@ -20,8 +21,24 @@ BELOW_SECONDS = {  # names of the rest of a second in a column of its own, and i
     re.compile(r"n(ano)?s(ec(ond)?s?)?", re.IGNORECASE): 1,
     re.compile(r"(u|micro)s(ec(ond)?s?)?", re.IGNORECASE): 1000,
 }
+CALENDAR = {  # names of columns that hold a part of a date or of a clock
+    "year": r"years?|yyyy",
+    "month": r"months?",
+    "day": r"days?|day_of_month",
+    "hour": r"hours?|hh|hrs?",
+    "minute": r"min(ute)?s?",
+    "second": r"sec(ond)?s?",
+}
+RANGES = {"year": (1970, 2261), "month": (1, 12), "day": (1, 31), "hour": (0, 23), "minute": (0, 59), "second": (0, 60)}
+JOINED = "time [ns]"
+MILLISECONDS = re.compile(r"(m|milli)s(ec(ond)?s?)?|millis", re.IGNORECASE)
+ALWAYS = 0.99  # share of the steps of a time that do not go back
 POSITIONS = r"(.*_)?(pos(e|ition)?s?|translations?|traj(ectory)?|locations?|xyz)(_.*)?"  # names of a table of positions
+MOST_UNTIMED = 0.01  # share of the rows of a table that may lack its time: a mean below them, a garbled field
 MOST_STEPS = 4.0  # median steps of positions, over which none are interpolated
+QUARTER_NS, FARTHEST_NS, MOST_OFF_NS = 900 * 10**9, 14 * 3600 * 10**9, 60 * 10**9  # of zones; between two clocks of a table
+SINCE_NS = 10**18  # in 2001; smaller times may count from any start
+SINCE_1970 = rf"(.*_)?{TIME_WORDS}|.*(since_?1970|epoch|unix|posix).*"
 TIME_OF = rf"((?P<before>.+?)_)?{TIME_WORDS}|{TIME_WORDS}_(?P<behind>.+)"  # imu_time, time_gps
 
 
@@ -55,6 +72,81 @@ def join_stamps(columns: Columns) -> None:
             columns.texts[name] = texts
 
 
+def join_calendar(columns: Columns) -> None:
+    """Make one time of an hour, a minute, a second, and perhaps a date, in columns of their own."""
+    named = {split_name(column)[0]: column for column in columns.values}
+    found = {part: next((named[n] for n in named if re.fullmatch(pattern, n)), "") for part, pattern in CALENDAR.items()}
+    has_date = all(map(found.get, ("year", "month", "day")))
+    wanted = [part for part in CALENDAR if has_date or part in ("hour", "minute", "second")]
+    if not all(map(found.get, wanted)) or "time" in named:
+        return
+    values = {part: columns.values[found[part]].astype(float) for part in wanted}
+    fits = [np.all((each >= RANGES[part][0]) & (each <= RANGES[part][1])) for part, each in values.items()]  # NaN fits none
+    if not all(fits) or len({*map(len, values.values())}) != 1:
+        return
+    t_ns = np.rint((values["hour"] * 3600.0 + values["minute"] * 60.0 + values["second"]) * NS).astype(np.int64)
+    if has_date:
+        months = ((values["year"] - 1970) * 12 + values["month"] - 1).astype(np.int64).astype("M8[M]")
+        t_ns += (months.astype("M8[D]").astype(np.int64) + values["day"].astype(np.int64) - 1) * 86_400 * NS
+    for part in wanted:
+        del columns.values[found[part]]
+        columns.texts.pop(found[part], None)
+    columns.values, columns.units[JOINED] = {JOINED: t_ns, **columns.values}, "ns"
+    columns.local_times.extend([JOINED] if has_date else [])
+    said = ", ".join(repr(found[part]) for part in wanted)
+    columns.remarks.notes.append(f"{said} are one time, which names no zone and counts as UTC")
+
+
+def join_milliseconds(columns: Columns) -> None:
+    """Give a time in whole seconds the milliseconds that stand in a column of their own.
+
+    They are those of the second, or count from a start and lead up within the same second in each row.
+    """
+    counts = {c: values.astype(np.int64) for c, values in columns.values.items() if values.dtype.kind in "iu"}
+    spelled = {c: name_and_unit(c, columns.units.get(c, "")) for c in counts}
+    parts = [c for c in counts if MILLISECONDS.fullmatch(c) or spelled[c] == ("time", "ms")]
+    for part, column in product(parts, counts):
+        (name, unit), seconds, ns = spelled[column], counts[column], counts[part] * 1_000_000
+        size = {"ns": 1, "s": NS, "": NS}.get(unit, 0)
+        is_time = part != column and size and re.fullmatch(rf"(.*_)?{TIME_WORDS}|sec(ond)?s?", name or unit)
+        if not is_time or not len(seconds) == len(ns) > 1 or not 0 < seconds.max() <= LAST_S * NS // size:
+            continue
+        t_ns = seconds * size
+        if (t_ns % NS).any():
+            continue
+        start = t_ns - ns
+        if 0 <= ns.min() <= ns.max() < NS:
+            t_ns = t_ns + ns
+        elif MILLISECONDS.fullmatch(part) and start.max() < start.min() + NS:
+            t_ns = ns + start.max()
+        if np.mean(np.diff(t_ns) >= 0) >= ALWAYS and np.mean(np.diff(t_ns) > 0) > np.mean(np.diff(seconds) > 0):
+            columns.values[column], columns.units[column] = t_ns, "ns"
+            columns.texts.pop(column, None)
+            columns.remarks.notes.append(f"{part!r} holds the milliseconds of {column!r}")
+
+
+def settle_zones(columns: Columns) -> None:
+    """Take the zone of dates that name none from a time since 1970 beside them, row by row."""
+    for local in columns.local_times:
+        dates = columns.values[local]
+        for column, values in columns.values.items():
+            name, unit = name_and_unit(column, columns.units.get(column, ""))
+            if column in columns.local_times or len(values) != len(dates) or not re.fullmatch(SINCE_1970, name or unit):
+                continue
+            times = values.astype(float)
+            units = [unit] if unit in TIME_NS else units_of_time(float(times[0]), usual_step(times))
+            times = times * TIME_NS[units[0]] if len(units) == 1 else np.zeros(len(times))
+            if not SINCE_NS < times.min() <= times.max() < LAST_S * NS:
+                continue
+            ahead_ns = dates - np.rint(times).astype(np.int64)
+            zone_ns = np.rint(ahead_ns / QUARTER_NS).astype(np.int64) * QUARTER_NS
+            if np.abs(ahead_ns - zone_ns).max() < MOST_OFF_NS and 0 < np.abs(zone_ns).max() <= FARTHEST_NS:
+                columns.values[local] = dates - zone_ns
+                hours = " and ".join(f"{each / 3.6e12:+g} h" for each in np.unique(zone_ns))
+                columns.remarks.notes.append(f"{local} is in a zone of {hours} by {column!r}, and is UTC in the log")
+                break
+
+
 def _is_whole(columns: Columns, column: str) -> bool:
     """Whether a column holds whole numbers; some may be missing."""
     values = columns.values[column]
@@ -70,11 +162,18 @@ def sort_by_clock(columns: Columns) -> None:
     known = {column: np.isfinite(values.astype(float)) for column, values in columns.values.items()}
     named = {c: match for c in known if (match := re.fullmatch(TIME_OF, name_and_unit(c, "")[0] or "time"))}
     clocks = {c: known[c] for c in named if known[c].any() and goes_on(columns.values[c][known[c]])}
-    if len({len(rows) for rows in known.values()}) != 1 or not clocks or any(rows.all() for rows in clocks.values()):
+    if len({len(rows) for rows in known.values()}) != 1 or not clocks:
+        return
+    if any(rows.all() for rows in clocks.values()):
+        _cut_blocks(columns, known, clocks)
         return
     timed = np.any([*clocks.values()], axis=0)
     if any((rows & ~timed).any() for rows in known.values()):
-        return
+        if len(clocks) > 1 or np.mean(~timed) > MOST_UNTIMED:
+            return
+        first = f"the first is row {int((~timed).argmax()) + 1}"
+        said = f"{int((~timed).sum())} rows without a number in {next(iter(clocks))!r} are left out"
+        columns.remarks.losses.append(f"{said} ({first})")
     groups = {c: named[c]["before"] or named[c]["behind"] or c for c in clocks}
     apart = Columns()
     if [*groups.values()] == [*clocks] and len(clocks) == 1:  # of one table, with blank rows
@@ -91,6 +190,28 @@ def sort_by_clock(columns: Columns) -> None:
         _take_rows(columns, clock, rows, apart, f"{groups[clock]}/time")
         apart.units[f"{groups[clock]}/time"] = columns.units.get(clock) or name_and_unit(clock, "")[1]
     columns.remarks.notes.append(f"each of {', '.join(clocks)} is the time of the rows in which it stands")
+    columns.values, columns.units, columns.texts = apart.values, apart.units, apart.texts
+
+
+def _cut_blocks(columns: Columns, known: dict[str, np.ndarray], clocks: dict[str, np.ndarray]) -> None:
+    """Give sensors side by side, each behind its own time, their rows and a group each.
+
+    The columns of `Time (s), Acc x (g), ..., Time (s), Gyro x (deg/s), ...` become `block 1/time`, `block 1/Acc x (g)`, ....
+    """
+    if next(iter(known)) not in clocks or all(rows.all() for rows in clocks.values()):
+        return
+    apart, of, groups = Columns(), "", dict[str, str]()
+    for column, rows in known.items():
+        of = column if column in clocks else of
+        count = int(clocks[of].sum())
+        if rows[count:].any() or not clocks[of][:count].all():  # values without a time, or blank rows in between
+            return
+        name = "time" if column == of else column
+        groups[column] = f"block {[*clocks].index(of) + 1}/{name}"
+        _take_rows(columns, column, clocks[of], apart, groups[column])
+        if column == of:
+            apart.units[groups[column]] = columns.units.get(column) or name_and_unit(column, "")[1]
+    columns.remarks.notes.append(f"each of {', '.join(clocks)} is the time of the columns behind it, and of as many rows")
     columns.values, columns.units, columns.texts = apart.values, apart.units, apart.texts
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 DECIMAL_COMMA = re.compile(r"[+-]?(0?,\d+|\d+,(\d\d?|\d{4,}))([eE][+-]?\d+)?")  # in quotes; of 1,234 it may mark thousands
+GROUPED = re.compile(r"[+-]?(0|[1-9]\d{0,2}(\.\d{3})*)(,\d+)?")  # 1.234.567,8
 WHOLE_NUMBER = re.compile(r"[+-]?\d{1,19}")
 SAMPLED = 200  # rows that show which columns are whole numbers
 EXACT = 2.0**15  # larger numbers that are not whole keep their texts: seconds since 1970 and days lose nanoseconds as float64
@@ -94,6 +95,24 @@ def decimal_points(texts: list[str], mark: re.Pattern[str]) -> list[str]:
     """Fields with points for their decimal commas; none where no field has one."""
     has_one = "," in "".join(texts) and any("," in text and mark.fullmatch(text) for text in texts)
     return [text.replace(",", ".") for text in texts] if has_one else []
+
+
+def without_thousands(lines: list[str], delimiter: str | None) -> tuple[list[str], list[int]]:
+    """Rows without points that mark thousands, and the places of their columns."""
+    if delimiter == "," or not any(
+        COMMA_NUMBER.fullmatch(text) for row in fields_of(lines[:SAMPLED], delimiter) for text in row
+    ):
+        return lines, []
+    rows = [[text.strip().strip('"') for text in row] for row in fields_of(lines, delimiter)]
+    width = len(rows[0])
+    columns = ([row[place] for row in rows if len(row) == width and row[place]] for place in range(width))
+    grouped = [
+        k for k, texts in enumerate(columns) if any("." in text for text in texts) and all(map(GROUPED.fullmatch, texts))
+    ]
+    for row in rows if grouped else ():
+        for place in grouped if len(row) == width else ():
+            row[place] = row[place].replace(".", "")
+    return [(delimiter or " ").join(row) for row in rows] if grouped else lines, grouped
 
 
 def numbers(texts: list[str]) -> tuple[np.ndarray, list[str]] | None:

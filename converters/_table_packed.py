@@ -25,7 +25,7 @@ from ._archive import CHUNK, HEAD, MAX_RATIO, RATIO_FREE, refusing
 from ._source import head
 
 TABLES = ".csv", ".txt", ".tsv", ".dat"
-ENDINGS = ".gz", ".xz", ".bz2", ".zst", ".zip"
+ENDINGS = ".gz", ".xz", ".bz2", ".zst", ".zstd", ".zip"  # a ROS 2 bag that is compressed as a whole ends in .zstd
 LIMIT = 4 << 30  # bytes of a table
 FEW_LINES, LONG_HEAD = 4, 1 << 18  # a header of hundreds of columns and a row of them are longer than the first bytes
 UTF16 = b"\xff\xfe", b"\xfe\xff"

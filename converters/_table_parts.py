@@ -24,7 +24,8 @@ from ._table_files import kind_of, load, may_hold_several
 from ._table_names import TIME_WORDS, group_of, is_of_recordings, is_of_sensors, leaf_of, split_name, tells_apart
 from ._table_recordings import distinct, groups_apart, part_name, renamed
 from ._table_text import Columns, no_numbers
-from ._table_times import LEAST_ROWS, begun_anew, is_counter
+from ._table_times import is_counter
+from ._table_wraps import LEAST_ROWS, begun_anew
 
 NOT_BACK, UP = 0.99, 0.5  # shares of the steps of a time that do not go back, and that go on
 MOST_SAID = 5  # rows

@@ -20,8 +20,10 @@ from ._table_names import (
     SI_WORDS,
     WITHOUT_GRAVITY,
     group_of,
+    leaf_of,
     name_and_unit,
     spaced_name,
+    split_name,
     triples,
 )
 from ._table_text import Columns
@@ -40,6 +42,7 @@ RANGES = 250, 500, 1000, 2000  # deg/s, of InvenSense's gyros
 NEAR_FEET = 0.05  # share by which an acceleration may differ from gravity in ft/s^2, as one of 3.3 g in m/s^2 does
 LEAST_COUNTS = 50.0  # of gravity in whole numbers
 LONGEST_STEP_NS = 5e8  # of increments
+ROUNDING = 1e-6  # of the span of a column's values, by which a copy of it may differ
 MOST_SHOWN = 12  # triples of columns in a message
 NOTHING: Entries = {}
 
@@ -148,8 +151,15 @@ def _triples(sensor: str, names: dict[str, tuple[str, str]], columns: Columns) -
     """Columns x, y and z that are named as a sensor's, measured ones before estimated ones."""
     plain = {column: name for column, (name, _) in names.items()}
     spaced = {column: spaced_name(column) for column in names}
-    every = [*triples(sensor, plain, spaced).values()]
+    every = [*triples(sensor, plain, spaced).values()] or _by_units(GYRO_SI if sensor == "gyro" else ACCEL_SI, names)
     return [triple for triple in every if not re.search(ESTIMATED, spaced[triple["x"]])] or every
+
+
+def _by_units(units: dict[str, float], names: dict[str, tuple[str, str]]) -> list[dict[str, str]]:
+    """Columns x, y and z alone, whose units are a sensor's: `X (rad/s)`; none of several."""
+    leaves = {column: split_name(leaf_of(column))[0] for column, (_, unit) in names.items() if unit in units}
+    found = [(leaf, column) for column, leaf in leaves.items() if leaf in ("x", "y", "z")]
+    return [dict(found)] if sorted(leaf for leaf, _ in found) == ["x", "y", "z"] else []
 
 
 def _beside(gyros: Sequence[dict[str, str]], accels: Sequence[dict[str, str]]) -> Sequence[dict[str, str]]:
@@ -250,3 +260,25 @@ def _propose_increments(proposal: Proposal, columns: Columns) -> None:
             f'accel_scale = {rate_hz}  # with accel_unit = "m/s^2", if it holds increments of velocity (m/s)',
             f'gyro_scale = {rate_hz}  # with gyro_unit = "rad/s", if it holds increments of angle (rad)',
         ]
+
+
+def without_copies(proposals: dict[str, Proposal], columns: Columns) -> dict[str, Proposal]:
+    """IMUs without the copy in a table that joins those of a gyro and an accelerometer."""
+    kept: dict[str, list[str]] = {}
+    axes = {topic: [*each.unsigned("gyro", columns), *each.unsigned("accel", columns)] for topic, each in proposals.items()}
+    tables = {topic: {group_of(name).split("/")[0] for name in names} for topic, names in axes.items()}
+    for topic in sorted(axes, key=lambda topic: -len(tables[topic])):
+        for other, names in kept.items():
+            is_joined = len(tables[topic]) == 1 < len(tables[other]) and not tables[topic] & tables[other]
+            if is_joined and len(names) == len(axes[topic]) == 6 and _equal(columns, axes[topic], names):
+                columns.remarks.notes.append(f"{topic} is left out: it holds the samples of {other}")
+                break
+        else:
+            kept[topic] = axes[topic]
+    return {topic: each for topic, each in proposals.items() if topic in kept}
+
+
+def _equal(columns: Columns, names: list[str], others: list[str]) -> bool:
+    """Whether columns that vary are others, but for the rounding of their texts."""
+    pairs = [(columns.values[a].astype(float), columns.values[b].astype(float)) for a, b in zip(names, others, strict=True)]
+    return all(len(a) == len(b) and np.abs(a - b).max() < ROUNDING * np.ptp(a) for a, b in pairs)

@@ -18,7 +18,7 @@ from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
-from ._table_dates import calendar_times, damaged_times, join_dates
+from ._table_dates import NO_ZONE, calendar_times, damaged_times, join_dates
 from ._table_header import header_of, note_unused_header, refuse_other_header, units_in_comments
 from ._table_names import leaf_of, tells_apart
 from ._table_numbers import (
@@ -31,6 +31,7 @@ from ._table_numbers import (
     plain_columns,
     vector,
     vectors,
+    without_thousands,
 )
 from ._table_packed import UTF16
 
@@ -65,6 +66,7 @@ class Columns:
     labels: dict[str, list[str]] = field(default_factory=dict)  # texts of columns that tell recordings or sensors apart
     remarks: Remarks = field(default_factory=Remarks)
     sources: dict[str, str] = field(default_factory=dict)
+    local_times: list[str] = field(default_factory=list)  # columns of dates that name no zone
     has_structures: bool = False  # whose fields follow a dot, which in the name of a plain table's column makes no group
     is_mocap: bool = False  # the poses of a motion capture, whatever the file's name
 
@@ -205,16 +207,17 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
     if again := len(lines) - len(kept):  # as of files that were joined
         lines = kept
         columns.remarks.notes.append(f"{again} lines that repeat the header are left out")
-    values, fields, width = _columns_of(lines[first:], lines[:first], delimiter, columns)
+    body, grouped = without_thousands(lines[first:], delimiter)
+    values, fields, width = _columns_of(body, lines[:first], delimiter, columns)
     refuse_other_header(fields, path)
     firsts = [row[0].strip().strip('"') for row in fields_of(lines[first : first + FIRSTS], delimiter) if len(row) == width]
     names, units = header_of(lines[:first], delimiter, width, firsts)
+    columns.remarks.notes.extend([f"points mark thousands: {', '.join(names[k] for k in grouped)}"] if grouped else [])
     note_unused_header(lines[:first], delimiter, names, columns.remarks)
     for unit, of in units_in_comments((line for line in lines[:first] if line.startswith(COMMENTS)), names).items():
         units |= dict.fromkeys(of, unit)
         columns.remarks.notes.append(f"{', '.join(of)} in {unit}, by a comment above the table")
-    commas: list[str] = []
-    empty: list[str] = []
+    commas, empty = list[str](), list[str]()
     if (joined := join_dates(names, fields)) is not None:
         del values[joined]
     for place, (named, read, texts) in enumerate(zip(names, values, fields, strict=True), 1):
@@ -229,11 +232,10 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
         if pointed := decimal_points(texts, COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA):
             texts[:] = pointed
             commas.append(name)
-        _add_fields(columns, name, texts, units.get(name, ""))
+        add_fields(columns, name, texts, units.get(name, ""))
     if left := ", ".join(filter(None, empty)):
         columns.remarks.notes.append(f"columns without a value are left out: {left}")
-    if commas:
-        columns.remarks.notes.append(f"decimal commas are read as points: {', '.join(commas)}")
+    columns.remarks.notes.extend([f"decimal commas are read as points: {', '.join(commas)}"] if commas else [])
 
 
 def _columns_of(
@@ -257,7 +259,7 @@ def _columns_of(
     return [None] * len(fields), fields, width
 
 
-def _add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> None:
+def add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> None:
     """Add a column of texts as numbers, vectors or times, or say what it is instead."""
     if (rows := vectors(texts)) is not None:
         columns.add(name, rows, unit)
@@ -267,6 +269,7 @@ def _add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> Non
             columns.remarks.notes.append(f"{name}: {len(odd)} fields, as {odd[0][:40]!r}, are no numbers and count as missing")
     elif (dated := calendar_times(texts)) is not None:
         columns.values[name], columns.units[name] = dated[0], "ns"
+        columns.local_times.extend([name] if NO_ZONE in dated[1] else [])
         columns.remarks.notes.extend(f"{name}: {note}" for note in dated[1])
     elif len(set(texts)) == 1:
         columns.remarks.notes.append(f"{name} is {texts[0][:200]!r} in every row")

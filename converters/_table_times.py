@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from imutool.array_types import Float64, Int64
 from imutool.errors import ConfigError
 from imutool.recording.message_log import MessageLog
 
@@ -15,6 +14,7 @@ from ._table_dates import NUMBERED, WEEK_NS, gps_times
 from ._table_names import TIME_WORDS, name_and_unit, split_name, unit_named
 from ._table_text import Columns
 from ._table_units import TIME_NS, USUAL_TIME_NS
+from ._table_wraps import begun_anew, unwrapped
 
 NS = 10**9
 COUNTED = "#counted "  # begins the name of a column of times that are counted
@@ -38,10 +38,6 @@ LEAST_WEEK, MOST_WEEK = 990, 5000  # of 1999, before which receivers counted aga
 DAY_NS = 86_400 * NS
 SERIAL_DAYS = {"Excel": 25_569, "MATLAB": 719_529}  # days of their calendars at the start of 1970
 FIRST_DAY, LAST_DAY = 10_957, 47_482  # of 2000 and of 2100, since 1970
-WORD_SIZES = 2**8, 2**16, 2**32  # at which a counter begins again
-MOST_OF_WORD = 0.9  # of its size, by which a counter falls where it begins again
-SIZES = *(2**k for k in range(4, 33)), *(10**k for k in range(10)), 24, 60, 3600, 86_400  # at which a time or a counter does
-LEAST_ROWS = 20  # of a recording, in the mean
 
 
 def join_gps_weeks(columns: Columns) -> None:
@@ -91,6 +87,7 @@ def read_clocks_and_days(columns: Columns) -> None:
             if step_ns > 0.0 and SLOWEST_HZ[1] <= NS / step_ns <= PLAUSIBLE_HZ[1]:
                 columns.values[column], columns.units[column] = np.rint(days * DAY_NS).astype(np.int64), "ns"
                 columns.texts.pop(column, None)
+                columns.local_times.append(column)
                 columns.remarks.notes.append(f"{column!r} counts days as {program} does; it names no zone and counts as UTC")
 
 
@@ -187,7 +184,7 @@ def counters_of(columns: Columns, length: int) -> list[str]:
     found = []
     for column, values in columns.values.items():
         if values.dtype.kind in "iu" and len(values) == length > 1:
-            steps = np.diff(_unwrapped(values))
+            steps = np.diff(unwrapped(values))
             regular = np.mean(steps == np.median(steps)) > 0.5 or re.search(COUNTER, column, re.IGNORECASE)
             if 1.0 <= np.median(steps) <= MOST_STEP and regular:
                 found.append(column)
@@ -196,7 +193,7 @@ def counters_of(columns: Columns, length: int) -> list[str]:
 
 def counts_others(values: np.ndarray) -> bool:
     """Whether a counter numbers other packets, too: steps are no multiples of the usual."""
-    steps = np.diff(_unwrapped(values))
+    steps = np.diff(unwrapped(values))
     return float(np.mean(steps % max(float(np.median(steps)), 1.0) != 0.0)) > MOST_ODD
 
 
@@ -205,32 +202,16 @@ def is_counter(name: str) -> bool:
     return re.search(COUNTER, name, re.IGNORECASE) is not None
 
 
-def begun_anew(values: np.ndarray) -> Int64[np.ndarray, " k"]:
-    """Rows in which a time or a counter begins anew, as in a table of several recordings.
-
-    None where it begins anew at a power of two, or as the seconds of a minute and the fractions of a second do.
-    """
-    steps = np.diff(values.astype(np.float64))
-    rows = np.flatnonzero(steps < 0.0) + 1
-    if not len(rows) or len(values) < LEAST_ROWS * (len(rows) + 1) or np.mean(steps > 0.0) < 0.5:
-        return np.zeros(0, np.int64)
-    step, last = float(np.median(steps[steps > 0.0])), values[rows - 1].astype(np.float64)
-    size = min(SIZES, key=lambda each: abs(float(last.max()) + step - each))
-    passed = last - values[np.concatenate([[0], rows[:-1]])]
-    is_wrap = abs(float(last.max()) + step - size) <= step and (last > size - MOST_SKIPPED * size).all()
-    return rows if not is_wrap and (-steps[rows - 1] > passed / 2.0).all() else np.zeros(0, np.int64)
-
-
 def said_steps(values: np.ndarray) -> str:
     """Shares of the most frequent steps of a counter, in words."""
-    steps, counts = np.unique(np.diff(_unwrapped(values)), return_counts=True)
+    steps, counts = np.unique(np.diff(unwrapped(values)), return_counts=True)
     most = np.argsort(-counts, kind="stable")[:3]
     return ", ".join(f"{100.0 * counts[n] / counts.sum():.0f} % of its steps are {steps[n]:g}" for n in most)
 
 
 def share_skipped(values: np.ndarray) -> float:
     """Share of the steps of a counter that are longer than the usual one."""
-    steps = np.diff(_unwrapped(values))
+    steps = np.diff(unwrapped(values))
     return float(np.mean(steps > np.median(steps)))
 
 
@@ -252,7 +233,7 @@ def count_times(columns: Columns, rate_hz: float, length: int, counter: str) -> 
             fix="Leave the counter out: the rows are counted then",
         )
     else:
-        counts = _unwrapped(values)
+        counts = unwrapped(values)
         if len(rows := begun_anew(values)):
             what = f"{counter!r} begins anew in row {rows[0] + 1}, and at no power of two"
             raise ConfigError(what, where="counter", expected="the samples of one recording")
@@ -260,25 +241,6 @@ def count_times(columns: Columns, rate_hz: float, length: int, counter: str) -> 
     name = f"{COUNTED}{counter or length}"
     columns.values[name], columns.units[name] = counts / rate_hz, "s"
     return name
-
-
-def _unwrapped(counts: np.ndarray) -> Float64[np.ndarray, " n"]:
-    """Counts since the first one, of a counter that begins again at a power of two."""
-    values = counts.astype(np.float64)
-    size = next((size for size in WORD_SIZES if values.max(initial=0.0) < size), 2**53)
-    return np.concatenate([[0.0], np.cumsum(np.diff(values) % size)])
-
-
-def without_overflow(values: np.ndarray, name: str, notes: list[str]) -> Int64[np.ndarray, " n"]:
-    """Whole numbers of a time that go on where a counter of 32 bits begins again."""
-    t: Int64[np.ndarray, " n"] = values.astype(np.int64)
-    falls = np.diff(t) < -MOST_OF_WORD * WORD_SIZES[-1]
-    if not falls.any() or t.min() < 0 or t.max() >= WORD_SIZES[-1]:
-        return t
-    note = f"{name!r} begins again at 2^32 ({int(falls.sum())} times): its times go on there"
-    notes += [note] if note not in notes else []
-    t[1:] += WORD_SIZES[-1] * np.cumsum(falls)
-    return t
 
 
 def begun_at_zero(log: MessageLog) -> MessageLog:

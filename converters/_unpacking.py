@@ -5,6 +5,7 @@ They may lie in a folder, or in each other. They are unpacked as a stream into a
 
 from __future__ import annotations
 
+import logging
 import shutil
 import zipfile
 from collections.abc import Collection, Iterator
@@ -34,6 +35,7 @@ from ._table_files import kind_of
 from ._table_folder import ENDINGS as TABLES
 from ._table_packed import is_packed_alone, pieces, table_name
 
+logger = logging.getLogger(__package__)
 TAR = ".tar"  # in .xz, .bz2 or .zst; a .tar.gz is an archive itself
 MOST_NESTED = 3  # archives in archives
 SHARE = 2  # at most one part in two of the free disk: the log needs its place, too
@@ -78,6 +80,12 @@ def unpacked(source: Path, out: Path, known: Collection[str] = ()) -> Iterator[U
     with holder as folder:
         root = Path(folder).resolve() / (top.name if source.is_dir() else _place(source))
         found = Unpacked(root, root)
+
+        def rename(record: logging.LogRecord) -> bool:
+            record.args = tuple(str(part).replace(str(root), str(source)) for part in record.args or ())
+            return True
+
+        logger.addFilter(rename)
         try:
             if source.is_dir():
                 for path in packed:
@@ -91,6 +99,8 @@ def unpacked(source: Path, out: Path, known: Collection[str] = ()) -> Iterator[U
             yield found
         except ImutoolError as error:
             raise error.renamed({str(root): str(source)}) from error
+        finally:
+            logger.removeFilter(rename)
 
 
 def _packed_below(folder: Path, known: Collection[str] = ()) -> list[Path]:

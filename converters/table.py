@@ -49,7 +49,7 @@ from ._table_names import topic_of
 from ._table_packed import table_name
 from ._table_parts import load_table, recordings_in, refuse_joined
 from ._table_pose_names import why_no_poses
-from ._table_propose import propose
+from ._table_propose import propose, without_copies
 from ._table_rotations import known_rotations, of_angles, of_matrices, unit_by_poses
 from ._table_text import Columns, matrix_columns
 from ._table_times import COUNTED, begun_at_zero, count_times
@@ -133,6 +133,7 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks, given: Entries) ->
     apart = {} if known_layout(columns) or given.keys() & {"gyro", "accel"} else imus_apart(columns)
     proposals = {topic: _proposal(part, given) for topic, part in (apart or {IMU_TOPIC: columns}).items()}
     share_units(proposals.values())
+    proposals = without_copies(proposals, columns)
     own_times = len({str(proposal.entries.get("time", "")) for proposal in proposals.values()}) > 1
     maps = []
     for topic, proposal in proposals.items():

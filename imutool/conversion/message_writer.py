@@ -128,10 +128,10 @@ class _Stream:
             number = self._define(replace(topic, name=f"{topic.name}/as_recorded", metadata=recorded))
             self.channels[topic] = number
             self._reflected[number] = cdr, found
-            units = "rad/s and m/s^2" if found.schema_name == schemas.IMU else "metres"
-            at = "" if found.stamp else f"; at the {LOG_TIME}, {WITHOUT_STAMP}"
-            note = f"{topic.name}: {topic.message_encoding} became {found.schema_name}, taken as {units}{at}"
-            self._source.remarks.notes.append(note)
+            si = "rad/s and m/s^2" if found.schema_name == schemas.IMU else "metres"
+            units = f"{found.units}, as the schema states" if found.units else si
+            note = f"{topic.name}: {topic.message_encoding} became {found.schema_name}, taken as {units}"
+            self._source.remarks.notes.append(note if found.stamp else f"{note}; at the {LOG_TIME}, {WITHOUT_STAMP}")
             return number
         kind = self._source.kinds.get(topic.name)
         marked = topic if kind is None else replace(topic, metadata=(*topic.metadata, (KIND_KEY, kind)))

@@ -44,7 +44,10 @@ class _Sequences:
         self.jobs += unpacked.jobs
         self.errors += [*unpacked.errors, *packed.errors]
         inside = [Path(place) for place in unpacked.places]
-        self.empty = [n for n, place in packed.places.items() if not any(path.is_relative_to(place) for path in inside)]
+        parts = [place for place in packed.places.values() if place.is_file() and place.parent in inside]  # as of a bag
+        self.empty = [
+            n for n, place in packed.places.items() if not any(path.is_relative_to(place) for path in (*inside, *parts))
+        ]
 
     def names(self) -> list[str]:
         return [job.sequence.name for job in self.jobs] + [name for name, _ in self.errors]

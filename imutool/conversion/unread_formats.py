@@ -15,10 +15,11 @@ ENOUGH = 1024  # bytes of a file's start
 MOST_FILES = 1000  # of a folder, which are looked at
 MOST_NAMED = 3  # pointers
 RECORDINGS = (  # endings of what may be a recording, or a part of one
-    r"\.(bag|db3|mcap|ulg|bin|log|csv|tsv|txt|dat|tum|jsonl?|mat|np[yz]|parquet|feather|arrow|h5|hdf5|xlsx?|zip|tar|gz|xz|bz2|zst)$"
+    r"\.(bag|db3|mcap|ulg|bin|log|csv|tsv|txt|dat|tum|jsonl?|mat|np[yz]|parquet|feather|arrow|h5|hdf5|xlsx?|zip|tar|gz|xz|bz2|zstd?)$"
 )
 GIVE_RIGHT = "Give yourself the right to read it, and convert again"
 POINTER, GET_FILES = rb"version https://git-lfs\.github\.com/spec/", "Get the files with git lfs pull, and convert again"
+ARCHIVE, ZIPPED_TABLES = rb"PK\x03\x04|.{257}ustar", (".xlsx", ".xlsm", ".npz")
 FORMATS = {  # what a file that begins like this is, and what to do
     rb"H Product:Blackbox": (
         "it is a blackbox log of Betaflight or INAV",
@@ -69,7 +70,7 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "Pivot it to a row for each time and a column for each axis, as pivot() of Flux and pivot_table() of pandas do",
     ),
     POINTER: ("it is a pointer of Git LFS in place of the file", GET_FILES),
-    rb"PK\x03\x04|.{257}ustar": (
+    ARCHIVE: (
         "it is an archive whose name does not end in .zip, .tar, .tar.gz or .tgz",
         "Give it the ending of its kind, or unpack it and convert the folder that is in it",
     ),
@@ -160,7 +161,8 @@ def describe_folder(folder: Path) -> tuple[str, str]:
         return "it is an acquisition of ST's High Speed Datalog", "Export it as CSV with ST's stdatalog, and convert that"
     said: dict[tuple[str, str], list[str]] = {}
     for path in paths[:MOST_FILES]:
-        if path.is_file() and (found := _known(first_bytes(path, ENOUGH))):
+        is_table = path.suffix.lower() in ZIPPED_TABLES  # that shows no IMU, and is no archive of recordings
+        if path.is_file() and not is_table and (found := _known(first_bytes(path, ENOUGH))):
             said.setdefault(found, []).append(path.name)
     if said:
         (what, fix), alike = max(said.items(), key=lambda each: len(each[1]))
@@ -168,11 +170,11 @@ def describe_folder(folder: Path) -> tuple[str, str]:
         return f"of {alike[0]}{others}, {what}", fix
     if closed := _closed_in(folder):
         return f"{_listed(closed)} may not be read", GIVE_RIGHT
+    tables = (str(path.relative_to(folder)) for path in paths if re.search(RECORDINGS, path.name.lower()))
     if names:
-        return (
-            "",
-            "Name the file, or a folder nearer to it: four levels are searched, and tables that show no IMU are left out",
-        )
+        shown = f", as {first}, " if (first := next(tables, "")) else " "
+        named = "Name the file, or a folder nearer to it: four levels are searched"
+        return "", f"{named}, and tables that show no IMU{shown}are left out"
     return "it holds no files", "See whether the recording lies elsewhere"
 
 

@@ -287,3 +287,12 @@ def test_after_an_interrupt_nothing_is_left(log: Path) -> None:
         convert(source, log.parents[1] / "out/b.mcap", progress=interrupt)
     assert any(name.startswith(".imutool-") for name in seen)
     assert left(log.parents[1] / "out") == ["b.mcap"]  # which was whole
+
+
+def test_a_warning_about_a_packed_file_names_the_source(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rows = "\n".join(f"{n / 100},0.1,{n % 7 / 10},0.3,0.1,0.2,9.8" for n in range(200))
+    table = f"time [s],gyr_x [rad/s],gyr_y [rad/s],gyr_z [rad/s],acc_x [m/s^2],acc_y [m/s^2],acc_z [m/s^2]\n{rows}".encode()
+    source = zipped(tmp_path / "day.zip", {"ride/imu.csv": table, "ride/cut.json": b'[{"t": 1, "x": 2}, {'})
+    convert(source, tmp_path / "out", workers=1)
+    (said,) = (record.getMessage() for record in caplog.records if "cut.json" in record.getMessage())
+    assert f"{source}/ride/cut.json" in said

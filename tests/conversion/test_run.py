@@ -161,7 +161,9 @@ def test_an_unknown_format_is_refused_with_the_nearest(source, tmp_path):
         convert(source, tmp_path / "out", format="eurok")
 
 
-@pytest.mark.parametrize("kind", ["empty folder", "folder of notes", "text file", "empty file", "header alone"])
+@pytest.mark.parametrize(
+    "kind", ["empty folder", "folder of notes", "folder of arrays", "text file", "empty file", "header alone"]
+)
 def test_where_nothing_is_recognised_the_message_says_what_was_looked_for(tmp_path, kind):
     source = tmp_path / "source"
     texts = {"text file": "notes", "empty file": "", "header alone": "time,gx,gy,gz,ax,ay,az\n"}
@@ -172,9 +174,12 @@ def test_where_nothing_is_recognised_the_message_says_what_was_looked_for(tmp_pa
         source.mkdir()
         if kind == "folder of notes":
             (source / "notes.txt").write_text("notes")
+        if kind == "folder of arrays":
+            np.savez(source / "reward.npz", reward=np.arange(20.0))
     what, fix = {
         "empty folder": (": it holds no files", "See whether the recording lies elsewhere"),
         "folder of notes": ("", "Name the file, or a folder nearer to it: four levels"),
+        "folder of arrays": ("", "tables that show no IMU, as reward.npz, are left out"),
         "empty file": (": it is empty", "See whether the recorder"),
     }.get(kind, (": it is text without a row of four numbers.*", "See whether the recorder"))
     with pytest.raises(DataError, match=rf"no sequence found{what}; expected a ROS bag, an MCAP log.*{fix}"):

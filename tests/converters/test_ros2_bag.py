@@ -95,6 +95,15 @@ def test_a_split_bag_arrives_whole(convert, tmp_path, form):
     assert [t for _, t, _ in ours] == sorted(t for _, t, _ in theirs)
 
 
+def test_a_bag_that_is_compressed_by_file_is_read_without_its_metadata(convert, tmp_path):
+    bag = write_bag(tmp_path / "bag", *FORMS["sqlite3 by file"])
+    (bag / "metadata.yaml").unlink()
+    done = convert(bag, tmp_path / "bag.mcap")
+    assert done.returncode == 0, done.stderr
+    assert len(messages_of(tmp_path / "bag.mcap")[0]) == 3 * COUNT
+    assert "nothing in it shows" not in done.stderr
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_every_message_arrives_with_its_bytes(convert, tmp_path, form):
     bag, log = write_bag(tmp_path / "bag", *FORMS[form]), tmp_path / "bag.mcap"

@@ -595,3 +595,63 @@ def test_rows_of_another_width_are_losses(convert, tmp_path, row):
     assert done.returncode == 3
     assert "1 rows do not have 7 fields and are left out" in done.stderr
     same(tmp_path / "out.mcap")
+
+
+def test_points_beside_decimal_commas_mark_thousands(tmp_path):
+    counts = np.rint(ACCEL / 9.80665 * 1000.0).astype(int)
+    rows = zip(*(np.rint(T_NS / 1e6).astype(int), *counts.T), GYRO, strict=True)
+    lines = [
+        ";".join([*(f"{each:,}".replace(",", ".") for each in whole), *(f"{w:.9f}".replace(".", ",") for w in gyro)])
+        for *whole, gyro in rows
+    ]
+    header = "time (ms);acc_x (mg);acc_y (mg);acc_z (mg);gyro_x (rad/s);gyro_y (rad/s);gyro_z (rad/s)"
+    (tmp_path / "log.csv").write_text("\n".join([header, *lines]) + "\n")
+    (sequence,) = table.sequences(tmp_path / "log.csv")
+    imu = table.read_sequence(sequence).imus["/imu0"]
+    np.testing.assert_array_equal(imu.t_ns, np.rint(T_NS / 1e6).astype(int) * 1_000_000)
+    np.testing.assert_allclose(imu.accel, counts * 9.80665e-3, rtol=1e-12)
+    np.testing.assert_allclose(imu.gyro, GYRO, atol=1e-9)
+
+
+def test_arrays_of_structures_are_groups_of_columns(tmp_path):
+    kinds = [("t_ns", "i8"), ("gyro", "f8", 3), ("accel", [(axis, "f8") for axis in "xyz"])]
+    array = np.zeros(COUNT, kinds)
+    array["t_ns"], array["gyro"] = T_NS, GYRO
+    for axis, values in zip("xyz", ACCEL.T, strict=True):
+        array["accel"][axis] = values
+    np.savez(tmp_path / "log.npz", imu=array, temperature=np.full(COUNT, 20.0))
+    np.save(tmp_path / "log.npy", array)
+    for name in ("log.npz", "log.npy"):
+        (sequence,) = table.sequences(tmp_path / name)
+        imu = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"}).imus["/imu0"]
+        np.testing.assert_array_equal(imu.t_ns, T_NS)
+        np.testing.assert_array_equal(np.hstack([imu.gyro, imu.accel]), np.hstack([GYRO, ACCEL]))
+
+
+def test_counts_of_hdf5_are_scaled_by_the_scale_that_stands_beside_their_unit(tmp_path):
+    import h5py
+
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file["time_ns"], gyro = T_NS, file.create_dataset("gyro", data=np.rint(GYRO * 2**10).astype(np.int16))
+        gyro.attrs.update({"units": "rad/s", "scale": 2.0**-10})
+        file.create_dataset("accel", data=ACCEL).attrs["units"] = "m/s^2"
+    (sequence,) = table.sequences(tmp_path / "log.h5")
+    np.testing.assert_array_equal(table.read_sequence(sequence).imus["/imu0"].gyro, np.rint(GYRO * 2**10) * 2.0**-10)
+
+
+@pytest.mark.parametrize("kind", ["texts", "times of the day"])
+def test_times_of_parquet_may_be_texts_or_times_of_the_day(tmp_path, kind):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    t_us = T_NS % (86_400 * 10**9) // 1000
+    day = T_NS // (86_400 * 10**9) * 86_400 * 10**6 if kind == "texts" else 0
+    texts = [f"{each}Z" for each in (t_us + day).astype("M8[us]").astype(str).tolist()]
+    time = texts if kind == "texts" else pa.array(t_us, pa.time64("us"))
+    names = [f"{sensor}_{axis}" for sensor in ("gyro", "accel") for axis in "xyz"]
+    pq.write_table(
+        pa.table({"time": time, **dict(zip(names, np.hstack([GYRO, ACCEL]).T, strict=True))}), tmp_path / "log.parquet"
+    )
+    (sequence,) = table.sequences(tmp_path / "log.parquet")
+    imu = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"}).imus["/imu0"]
+    np.testing.assert_array_equal(imu.t_ns, (t_us + day) * 1000)

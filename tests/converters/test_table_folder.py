@@ -597,3 +597,16 @@ def test_a_folder_of_matrices_asks_for_a_map_and_takes_it(tmp_path):
     imu = table.read_sequence(found[0], mapping=given).imus["/imu0"]
     np.testing.assert_array_equal(imu.gyro, GYRO)
     np.testing.assert_array_equal(imu.accel, ACCEL)
+
+
+def test_a_table_that_joins_two_others_is_no_imu_of_its_own(tmp_path):
+    t_ms = 10.0 * np.arange(COUNT)
+    gyro, accel = GYRO, ACCEL + RNG.normal(0.0, 0.1, (COUNT, 3))
+    for name, values in (("gyro", gyro), ("acc", accel)):
+        write_csv(tmp_path / f"{name}.csv", ["time_ms", "x", "y", "z"], [t_ms, *values.T])
+    names = ["Time", *(f"{sensor}_{axis}" for sensor in ("Gyro", "Acc") for axis in "xyz")]
+    write_csv(tmp_path / "final.csv", names, [np.arange(COUNT), *np.round(np.hstack([gyro, accel]), 12).T])
+    (sequence,) = table.sequences(tmp_path)
+    log = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"})
+    assert [*log.imus] == ["/imu0"]
+    assert any("/final/imu is left out: it holds the samples of /imu0" in note for note in log.remarks.notes)

@@ -33,6 +33,12 @@ DOCUMENTS: dict[str, Any] = {
     "samples": FLAT,
     "below": {"meta": {"name": "walk"}, "data": {"samples": FLAT}},
     "arrays": {name: [row[name] for row in FLAT] for name in FLAT[0]},
+    "arrays of texts": {
+        name: [f"1970-01-01T00:00:{row[name] / 1000:06.3f}Z" if name == "t_ms" else str(row[name]) for row in FLAT]
+        for name in FLAT[0]
+    },
+    "objects by row, of pandas": {name: {str(n): row[name] for n, row in enumerate(FLAT)} for name in FLAT[0]},
+    "rows by number, of pandas": {str(n): row for n, row in enumerate(FLAT)},
     "columns": {"columns": list(FLAT[0]), "data": [list(row.values()) for row in FLAT]},
     "payload": {
         "payload": {

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from imutool.converters import table
+from imutool.errors import ConfigError
 
 COUNT, LATE_MS = 1000, 3
 GYRO = np.random.default_rng(8).normal(0.0, 0.1, (COUNT, 3))
@@ -134,3 +135,76 @@ def test_a_date_that_may_count_from_another_day_than_1970_began_is_noted(tmp_pat
     log = table.read_sequence(table.sequences(tmp_path)[0], mapping={"gyro_unit": "rad/s"})
     notes = [note for note in log.remarks.notes if "if it counts since" in note]
     assert [f"begins on {kept} if" in note and f"; on {said}" in note for note in notes] == [True] * bool(said)
+
+
+@pytest.mark.parametrize("name", ["TimeIntervalSince1970", "utc_time [ms]"])
+def test_a_time_since_1970_shows_the_zone_of_dates_that_name_none(tmp_path: Path, name: str) -> None:
+    t_ns = 1_698_537_597_000_000_000 + T_NS  # summer time ends in Europe after 3 s
+    hours = np.where(T_NS < 3 * 10**9, 2, 1)
+    moments = (t_ns // 1000 + 3_600_000_000 * hours).astype("M8[us]").astype(str)
+    stated = t_ns // 1_000_000 if "ms" in name else t_ns / 1e9
+    rows = lines(np.array([f"{moment},{each}" for moment, each in zip(moments, stated.tolist(), strict=True)]), GYRO, ACCEL)
+    (tmp_path / "log.csv").write_text("\n".join([f"Timestamp,{name},gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path)[0], mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_array_equal(log.imus["/imu0"].t_ns, t_ns)
+    assert any(f"Timestamp is in a zone of +1 h and +2 h by '{name}'" in note for note in log.remarks.notes)
+
+
+@pytest.mark.parametrize("names", ["Acceleration {} (m/s^2) Gyroscope {} (rad/s)", "{} (m/s^2) {} (rad/s)"])
+@pytest.mark.parametrize("short", ["gyro", "accel"])
+def test_sensors_side_by_side_have_the_rows_of_their_own_times(tmp_path: Path, names: str, short: str) -> None:
+    units = names.replace(") ", ")|").split("|")
+    header = ",".join(",".join(["Time (s)", *(each.format(axis) for axis in "xyz")]) for each in units)
+    t_s = T_NS[:, None] / 1e9
+    whole = [lines(t_s[:, 0], values) for values in (ACCEL, GYRO)]
+    place = ["accel", "gyro"].index(short)
+    whole[place] = whole[place][::2] + [",,,"] * (COUNT // 2)
+    (tmp_path / "log.csv").write_text("\n".join([header, *map(",".join, zip(*whole, strict=True))]) + "\n")
+    imu = table.read_sequence(table.sequences(tmp_path)[0]).imus["/imu0"]
+    step = 2 if short == "gyro" else 1
+    np.testing.assert_array_equal(imu.t_ns, T_NS[::step][: len(imu)])
+    np.testing.assert_array_equal(imu.gyro, GYRO[::step][: len(imu)])
+    np.testing.assert_allclose(imu.accel[::2], ACCEL[:: 2 * step][: len(imu.accel[::2])], rtol=1e-12)
+
+
+PARTS = {  # of a time, and what they are where they are one
+    "seconds and milliseconds": ("{s},{ms}", "seconds,milliseconds", 0),
+    "two times": ("{s},{ms}", "time_s,time_ms", 0),
+    "a date and milliseconds": ("{date},{ms}", "Timestamp,Milliseconds", 0),
+    "a date and milliseconds since the start": ("{date},{all}", "Timestamp,Milliseconds", 0),
+    "a clock and a date": ("{y},{m},{d},{H},{M},{S},{ms}", "year,month,day,hour,minute,second,millisecond", 0),
+    "a clock": ("{H},{M},{S},{ms}", "hour,min,sec,msec", 20_405 * 86_400 * 10**9),
+}
+
+
+@pytest.mark.parametrize("form", PARTS)
+def test_a_time_in_parts_keeps_its_milliseconds_and_its_gaps(tmp_path: Path, form: str) -> None:
+    row, header, day_ns = PARTS[form]
+    kept = np.setdiff1d(np.arange(COUNT), np.arange(130, 170))
+    t_ns = (1_763_078_399_600_000_000 + T_NS)[kept]  # midnight is 400 ms later
+    fields = []
+    for t in t_ns.tolist():
+        at = datetime.fromtimestamp(t // 10**9, UTC)
+        clock = {"y": at.year, "m": at.month, "d": at.day, "H": at.hour, "M": at.minute, "S": at.second}
+        ms = {"ms": t // 10**6 % 1000, "all": (t - t_ns[0]) // 10**6}
+        fields.append(row.format(s=t // 10**9, date=at.strftime("%Y-%m-%d %H:%M:%S"), **clock, **ms))
+    rows = lines(np.array(fields), GYRO[kept], ACCEL[kept])
+    (tmp_path / "log.csv").write_text("\n".join([f"{header},gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path / "log.csv")[0], mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_array_equal(log.imus["/imu0"].t_ns, t_ns - day_ns)
+    assert not any("share the stamp" in note for note in log.remarks.notes)
+
+
+def test_a_time_since_a_start_is_no_zone_of_a_clock(tmp_path: Path) -> None:
+    rows = lines(np.array([f"10,0,{t // 10**9},{t / 1e9}" for t in T_NS.tolist()]), GYRO, ACCEL)
+    (tmp_path / "log.csv").write_text("\n".join(["hour,minute,second,elapsed_time (s),gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path)[0], mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_array_equal(log.imus["/imu0"].t_ns, T_NS)
+    assert not any("zone of" in note for note in log.remarks.notes)
+
+
+def test_rows_with_the_newest_first_are_to_be_sorted(tmp_path: Path) -> None:
+    rows = lines(T_NS // 1_000_000, GYRO, ACCEL)[::-1]
+    (tmp_path / "log.csv").write_text("\n".join(["time_ms,gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    with pytest.raises(ConfigError, match="'time_ms' is named as a time and falls from row to row: sort the rows by it"):
+        table.read_sequence(table.sequences(tmp_path / "log.csv")[0], mapping={"gyro_unit": "rad/s"})

@@ -853,10 +853,12 @@ def test_further_columns_whose_names_have_the_same_latin_letters_are_topics_of_t
 
 def test_many_samples_that_come_late_by_less_than_a_second_are_a_loss(tmp_path):
     names = ["Time (ms)", *(f"acc_{a} [g]" for a in "xyz"), *(f"gyro_{a} [deg/s]" for a in "xyz")]
-    log = read(write_csv(tmp_path / "imu.csv", names, [np.round(1000 * T_S) % 1000, *ACCEL_G.T, *COUNTS.T]))
-    assert len(log.imus["/imu0"]) == 100
+    log = read(
+        write_csv(tmp_path / "imu.csv", names, [np.round(1000 * T_S) - 400 * np.floor(T_S + 1e-9), *ACCEL_G.T, *COUNTS.T])
+    )
+    assert len(log.imus["/imu0"]) == 220
     assert log.remarks.losses == [
-        "/imu0: 200 of 300 samples are left out, as their time goes back to that of samples before them"
+        "/imu0: 80 of 300 samples are left out, as their time goes back to that of samples before them"
     ]
 
 
@@ -868,6 +870,41 @@ def test_a_counter_of_32_bits_goes_on_where_it_begins_again(tmp_path):
     assert log.imus["/imu0"].t_ns.tolist() == (1000 * t_us).tolist()
     assert log.remarks.losses == []
     assert log.remarks.notes.count("'time_us' begins again at 2^32 (1 times): its times go on there") == 1
+
+
+@pytest.mark.parametrize(
+    ("unit", "size", "first", "said"),
+    [
+        ("us", 2**24, 2**24 - 1_000_000, "2^24"),
+        ("us", 2**32, 2**31 - 1_000_000, "2^32"),  # with a sign
+        ("ms", 2**16, 2**16 - 1000, "2^16"),
+        ("ms", 1000, 0, "1 s"),
+        ("s", 86_400.0, 86_399.0, "86400 s"),
+        ("s", 604_800.0, 604_799.0, "604800 s"),
+        ("min", 60.0, 59.99, "3600 s"),
+    ],
+)
+def test_a_time_goes_on_where_it_begins_again(tmp_path, unit, size, first, said):
+    names = [f"time ({unit})", *(f"acc_{a} [g]" for a in "xyz"), *(f"gyro_{a} [deg/s]" for a in "xyz")]
+    ns = {"us": 1000, "ms": 10**6, "s": 10**9, "min": 60 * 10**9}[unit]
+    t = first + np.round(T_S * 1e9 / ns, 9).astype(type(size))
+    low = -(2**31) if first == 2**31 - 1_000_000 else 0
+    log = read(write_csv(tmp_path / "imu.csv", names, [(t - low) % size + low, *ACCEL_G.T, *COUNTS.T]))
+    np.testing.assert_allclose(log.imus["/imu0"].t_ns, t.astype(float) * ns, rtol=0.0, atol=1000)
+    assert any(f"begins again at {said} (" in note for note in log.remarks.notes)
+    assert log.remarks.losses == []
+
+
+@pytest.mark.parametrize("odd", ["mean", ""])
+def test_a_row_without_a_time_is_left_out_and_named(tmp_path, odd):
+    path = write_csv(
+        tmp_path / "imu.csv", [*NAMES[:4], *(f"{each} (deg/s)" for each in NAMES[4:])], [T_S, *ACCEL_G.T, *COUNTS.T]
+    )
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines, ",".join([odd, *lines[1].split(",")[1:]])]) + "\n")
+    log = read(path)
+    assert len(log.imus["/imu0"]) == COUNT
+    assert log.remarks.losses == [f"1 rows without a number in {NAMES[0]!r} are left out (the first is row {COUNT + 1})"]
 
 
 NAMED_AND_IN_UNITS = "time,gx,gy,gz,ax,ay,az\ns,rad/s,rad/s,rad/s,g,g,g"

@@ -80,7 +80,23 @@ def _tree(value: Any, depth: int) -> Any:
 
 
 class Json:
-    """Messages in JSON."""
+    """Messages in JSON, perhaps with a JSON Schema."""
+
+    def __init__(self, schema: bytes = b"") -> None:
+        try:
+            self._schema = json.loads(schema or b"{}")
+        except ValueError:
+            self._schema = {}
+
+    def comments(self, path: Path) -> Iterator[str]:
+        """What the schema says of a field and of those around it, the nearest first."""
+        node, found = self._schema, list[str]()
+        for key in path:
+            inner = node.get("properties") if isinstance(node, dict) else None
+            node = inner.get(key) if isinstance(inner, dict) else None
+            said = [node.get(name, "") for name in ("unit", "units", "description", "title")] if isinstance(node, dict) else []
+            found.append(next((text for text in said if isinstance(text, str) and text), ""))
+        yield from reversed(found)
 
     def parse(self, raw: bytes) -> Any:
         """Value from its text.

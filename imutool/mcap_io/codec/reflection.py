@@ -70,7 +70,7 @@ class Reflected:
     covariances: tuple[Path | None, ...] = ()
     other_stamps: tuple[Path, ...] = ()  # further times in the message, which do not count
     sizes: tuple[float, float] = (1.0, 1.0)  # of the rates and the accelerations of an IMU in SI, as the definition states
-    units: str = ""  # that the comments of the definition state, in words
+    units: str = ""  # that the definition states, in words
 
     def sample(self, raw: bytes, log_time: int) -> Sample:
         """Sample in a message; at its log time where it has no stamp.
@@ -154,7 +154,8 @@ class Reflected:
                 for first in (GYRO_COVARIANCE.start, GYRO_COVARIANCE.start + 12)
             ]
             for n, stamp_ns in enumerate(columns.stamp_ns.tolist()):
-                values = [*columns.gyro[n].tolist(), *columns.accel[n].tolist()]
+                gyro, accel = columns.gyro[n] / self.sizes[0], columns.accel[n] / self.sizes[1]
+                values = [*gyro.tolist(), *accel.tolist()]
                 fields = [*_parts(stamp_ns, self.stamp), *zip(self.vectors, values, strict=True)]
                 if self.frame is not None:
                     fields.append((self.frame, columns.frame_id))
@@ -188,7 +189,7 @@ def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: b
     if form is None or not isinstance(tree, Mapping):
         return None
     if (imu := _found(tree, form)) is not None:
-        return imu
+        return _in_si(imu, form) if isinstance(form, Json) else imu
     return _pose(tree, form) if re.search(POSE_TYPES, f"{topic} {schema_name}".lower()) else None
 
 
@@ -199,7 +200,7 @@ def format_of(encoding: str, schema_name: str, schema: bytes) -> Any:
         ImportError: the schema is of protobuf, which is not installed.
     """
     if encoding == "json":
-        return Json()
+        return Json(schema)
     if encoding == "flatbuffer":
         return FlatBuffer.of(schema_name, schema)
     if encoding != "protobuf":
@@ -225,8 +226,11 @@ def reflect_cdr(schema_name: str, schema: bytes) -> Reflected | None:
     except LogError:
         return None
     found = _found(form.tree(DEPTH), form)
-    if found is None:
-        return None
+    return None if found is None else _in_si(found, form)
+
+
+def _in_si(found: Reflected, form: ros2_definition.DescribedCdr | Json) -> Reflected:
+    """Fields of an IMU with the sizes of the units that the definition states."""
     first = (form.comments(found.vectors[0]), STATED["gyro"]), (form.comments(found.vectors[3]), STATED["accel"])
     stated = dict(zip(STATED, (_stated(comments, units) for comments, units in first), strict=True))
     said = ", ".join(f"{sensor} in {unit}" for sensor, (unit, _) in stated.items() if unit)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import struct
 
 import numpy as np
 import pytest
 
-from imutool.mcap_io.codec.reflection import Reflected, reflect_cdr
+from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
 
 VALUES = 10.0, -20.0, 30.0, 0.1, -0.2, 1.0
 RAW = b"\0\1\0\0" + struct.pack("<6d", *VALUES)
@@ -48,3 +49,15 @@ def test_a_correction_is_written_in_the_unit_of_the_message() -> None:
     found = reflected(fields("  # deg/s", "  # g"))
     turned = found.with_vectors(RAW, np.stack([np.diag([1.0, -1.0, -1.0])] * 2))
     np.testing.assert_allclose(struct.unpack("<6d", turned[4:]), np.multiply(VALUES, [1, -1, -1, 1, -1, -1]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("key", ["description", "unit"])
+def test_the_units_in_a_json_schema_count_both_ways(key: str) -> None:
+    schema = {"properties": {"gyro": {"type": "object", key: "deg/s"}, "accel": {"type": "array", key: "g"}}}
+    raw = json.dumps({"gyro": dict(zip("xyz", VALUES[:3], strict=True)), "accel": VALUES[3:], "t_ns": 5}).encode()
+    found = reflect("json", "/imu", "Imu", json.dumps(schema).encode(), raw)
+    assert found is not None
+    sample = found.sample(raw, 0)
+    np.testing.assert_allclose(sample.values, VALUES * np.repeat([DEG, G], 3), rtol=1e-12)
+    again = json.loads(found.from_cdr(found.encode([sample]))[0])
+    np.testing.assert_allclose([*again["gyro"].values(), *again["accel"]], VALUES, rtol=1e-12)

@@ -1,0 +1,69 @@
+"""Arrays of NumPy: .npz and .npy."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ._table_headerless import name_headerless
+from ._table_mat import check_size
+from ._table_text import WIDEST, Columns
+
+
+def load_npz(path: Path, columns: Columns) -> None:
+    """Add the arrays of a .npz."""
+    with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            with archive.open(info) as member:  # the size that the array states, whatever the archive says
+                shape = npy_shape(member) if info.filename.endswith(".npy") else ()
+            check_size(path, max(info.file_size, 8 * int(np.prod(shape, dtype=float))))
+        check_size(path, sum(info.file_size for info in archive.infolist()))
+    with np.load(path, allow_pickle=False) as arrays:
+        for name in arrays.files:
+            _add(columns, name, arrays[name])
+
+
+def load_npy(path: Path, columns: Columns) -> None:
+    """Add one array, whose columns have no names unless its type states them."""
+    array = read_npy(path)
+    if array.dtype.names:
+        _add(columns, "", array)
+        return
+    if array.ndim == 2 and array.shape[0] < array.shape[1]:
+        array = array.T
+    for number, column in enumerate(np.atleast_2d(array.T) if array.ndim in (1, 2) else [], 1):
+        if number <= WIDEST:
+            columns.add(f"column {number}", column)
+    name_headerless(columns)
+
+
+def _add(columns: Columns, name: str, array: np.ndarray) -> None:
+    """Add an array; of structures each field is one, in the group of the structure."""
+    for field in array.dtype.names or ():
+        _add(columns, f"{name}/{field}".removeprefix("/"), array[field])
+    if not array.dtype.names:
+        columns.add(name, array)
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """Array of a .npy.
+
+    Raises:
+        DataError: larger than a table may be.
+        ValueError: damaged, or of Python's objects.
+    """
+    with path.open("rb") as file:
+        check_size(path, 8 * int(np.prod(npy_shape(file), dtype=float)))
+    array: np.ndarray = np.load(path, allow_pickle=False)
+    return array
+
+
+def npy_shape(member: Any) -> tuple[int, ...]:
+    """Shape of the array that an open .npy states."""
+    version = np.lib.format.read_magic(member)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape: tuple[int, ...] = read(member)[0]
+    return shape
