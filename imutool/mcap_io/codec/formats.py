@@ -85,7 +85,7 @@ class Json:
     def __init__(self, schema: bytes = b"") -> None:
         try:
             self._schema = json.loads(schema or b"{}")
-        except ValueError:
+        except (ValueError, RecursionError):
             self._schema = {}
 
     def comments(self, path: Path) -> Iterator[str]:
