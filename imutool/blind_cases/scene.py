@@ -71,7 +71,7 @@ class Scene:
 
     def converter_input(self, acting: Acting, t_s: Times) -> Six:
         """Signal before the converter, without noise, a row for each true-clock time of a sample."""
-        order = sorted(acting, key=lambda pair: (pair[0].stage, pair[0].name))
+        order = sorted(acting, key=lambda pair: _place(pair[0]))
         taken = np.asarray(t_s, dtype=np.float64)
         for model, theta in order:
             if model.stage == Stage.CLOCK:
@@ -194,3 +194,10 @@ def place_scene(smoother: Smoother, noise: Noise, rng: Generator, longest_s: flo
 
 def _imu(t_s: Times, signal: Six) -> Imu:
     return Imu(stamps_ns(t_s), np.ascontiguousarray(signal[:, :3]), np.ascontiguousarray(signal[:, 3:]))
+
+
+def _place(model: Model) -> tuple[int, int, str]:
+    """Place of a model: its stage, there gains before what is added, by name, and G f while f is the ideal force."""
+    biases = ("bias_drift", "bias_step", "temperature")
+    rank = 3 if model.name.endswith(biases) else 2 if model.name.startswith("accel") else 0
+    return model.stage, 1 if model.name == "gyro_g_sensitivity" else rank, model.name

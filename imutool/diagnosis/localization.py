@@ -8,7 +8,7 @@ variables tried).
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -21,7 +21,9 @@ from imutool.diagnosis.result import Extent, Finding, Located
 from imutool.diagnosis.settings import LocalizationSettings
 from imutool.units import AXES, SENSORS
 
+NONE, ALIKE = 0.01, 1e-6  # share of the samples that differ by less than this of the noise, as where there is no misfit
 CALM_SHARE = 0.25  # of the seconds, that a misfit which comes and goes leaves alone
+EDGE_S = 0.05  # from which on an interval begins later than its window, or ends earlier
 FAR_MORE = 2.0  # times the squares that means hold, from which the samples count: what is so fast is lost in a mean
 TIMES = ("after", "in the first")  # how a regime of the time begins, above and below its threshold
 Samples = Float64[np.ndarray, "_ k"]
@@ -89,7 +91,7 @@ def _locate_log(
 ) -> list[Located]:
     """Segments of one log share its clock; each has its own constant."""
     t_s = np.concatenate([pair.stamp_s for pair, _ in segments])
-    misfit = np.concatenate([misfit - np.median(misfit, axis=0) for _, misfit in segments])
+    misfit = floor * np.concatenate([_without_bias(misfit / floor) for _, misfit in segments])
     each = [pair.variables() for pair, _ in segments]
     common = set.intersection(*map(set, each))  # a channel that is constant, or starts late, is not in every segment
     variables = {n: (unit, np.concatenate([own[n][1] for own in each])) for n, (unit, _) in each[0].items() if n in common}
@@ -135,7 +137,7 @@ def locate(
     """
     settings = settings or LocalizationSettings()
     located = []
-    scaled = (misfit - np.median(misfit, axis=0)) / noise
+    scaled = _without_bias(misfit / noise)
     seconds, window = np.unique(np.floor((t_s - t_s[0]) / settings.window_s), return_inverse=True)
     for signal, columns in signals.items():
         by_axis = np.stack([np.bincount(window, weights=column) for column in (scaled[:, columns] ** 2).T], axis=1)
@@ -149,12 +151,13 @@ def locate(
             inside = np.ones(len(power), bool)
         if not axes or not inside.any():
             continue
+        begins = float(t_s[0]) + settings.window_s * seconds[inside]
         extent, text = regime(inside, power, window, variables, settings)
         located.append(
             Located(
                 signal,
                 tuple(AXES[a] for a in axes) if len(axes_power) == len(AXES) else (),
-                tuple(intervals(float(t_s[0]) + settings.window_s * seconds[inside], settings)),
+                tuple(_acting(intervals(begins, settings), t_s, scaled[:, columns])),
                 text,
                 float(power[inside].sum() / max(power.sum(), 1e-300)),
                 p_values.get(signal, float(chi2.sf(axes_power.sum(), len(axes_power)))),
@@ -162,6 +165,28 @@ def locate(
             )
         )
     return sorted(located, key=lambda place: place.p_value)
+
+
+def _without_bias(scaled: Samples) -> Samples:
+    """Misfit over noise without a constant, which the bias takes: that of samples which are alike, as before it sets in."""
+    out = scaled - np.median(scaled, axis=0)
+    for k in range(out.shape[1]):
+        _, first, counts = np.unique(np.rint(out[:, k] / ALIKE), return_index=True, return_counts=True)
+        often = first[counts > NONE * len(out)]  # behind a step of a bias all are alike, too
+        out[:, k] -= out[often.min(), k] if len(often) else 0.0
+    return np.where(np.abs(out) < 2.0 * ALIKE, 0.0, out)
+
+
+def _acting(
+    found: Sequence[tuple[float, float]], t_s: Float64[np.ndarray, " n"], misfit: Samples
+) -> Iterator[tuple[float, float]]:
+    """Intervals from the first sample that differs to the last, where these are clearly inside."""
+    differs = t_s[misfit.any(axis=1)]
+    for ends in found:
+        own = differs[(differs >= ends[0]) & (differs < ends[1])].tolist()
+        if own:
+            begin, end = (at if abs(at - edge) > EDGE_S else edge for at, edge in zip((own[0], own[-1]), ends, strict=True))
+            yield begin, end
 
 
 def _beyond_noise(

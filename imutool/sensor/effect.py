@@ -223,9 +223,9 @@ def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.nd
 
 WITHIN_STAGE = {
     **{"declination": -4, "magnetometer_misalignment": -3, "soft_iron": -2},  # S R m_0 + h: the offset comes behind them
-    **{"gain": -2, "dead_band": -1, "saturation": 1, "quantization": 2},
-    **{"coulomb_friction": 1, "stribeck_friction": 1},  # they hold what all else leaves of a command
-    **{"actuator_gain": 2, "actuator_dead_band": 3, "torque_saturation": 3},  # between what the motion needs and the command
+    **{"gain": -2, "dead_band": -1, "gyro_g_sensitivity": 1, "saturation": 1, "quantization": 2},
+    **{"coulomb_friction": 1, "stribeck_friction": 1, "actuator_gain": 2},  # they hold what all else leaves of a command
+    **{"actuator_dead_band": 3, "torque_saturation": 3},  # between what the motion needs and the command
 }
 Acting = Sequence[tuple[Effect, Theta]]
 
@@ -297,4 +297,4 @@ def in_stage_order(acting: Acting) -> list[tuple[Effect, Theta]]:
 
 def stage_order(effect: Effect) -> tuple[int, int, str]:
     """Sorting key of an effect: its stage, then its place within it, then its key."""
-    return effect.stage, WITHIN_STAGE.get(effect.name, 0), effect.key
+    return effect.stage, WITHIN_STAGE.get(effect.name, int(effect.of_time)), effect.key  # S M omega + G f + b (Rehder 2016)

@@ -19,7 +19,7 @@ from imutool.units import AXES, UNITS, Sensor
 
 DRIVEN = "driven"
 # Within the stage SENSOR effects act by name. What has no name was learned from the ideal signals and comes first, upper case
-# sorting before lower; a bias and noise come last, so that no scale acts on them, and before the converter.
+# sorting before lower; a bias, noise and what depends on time alone come last, so that no scale acts on them.
 UNKNOWN, BIAS, NOISE = "Unknown", "~bias", "~noise"
 
 Variable = Callable[[SensorSamples], Float64[np.ndarray, " n"]]

@@ -74,7 +74,7 @@ class Sampler:
             DataError: a clock that is not even.
         """
         for last in self._instants:
-            if _same(last[0], t_s) and _same(last[1], taken_s):
+            if all(a is b or np.array_equal(a, b) for a, b in zip(last[:2], (t_s, taken_s), strict=True)):
                 return last
         first = int(np.abs(t_s - taken_s[0]).argmin())
         rows = slice(first, first + len(taken_s))
@@ -130,10 +130,6 @@ class Recent:
         value.flags.writeable = False
         self._known = ((of, at, value), *self._known[: RECENT - 1])
         return value
-
-
-def _same(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> bool:
-    return a is b or np.array_equal(a, b)
 
 
 def _weights(t_s: Float64[np.ndarray, " n"], taken_s: Float64[np.ndarray, " m"]) -> Any:
@@ -209,6 +205,11 @@ class MotionAt:
 
     motion: IdealMotion
     taken_s: Times
+
+    @cached_property
+    def accel(self) -> Vectors:
+        """Specific force."""
+        return self.motion.sampler.at(self.motion.accel, self.motion, self.taken_s)
 
     @cached_property
     def alpha(self) -> Vectors:

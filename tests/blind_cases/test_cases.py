@@ -271,6 +271,11 @@ def test_models_act_in_the_stated_order(scene: Scene) -> None:
     ideal = scene.ideal(scene.t_s)
     expected = 1.1 * np.stack([ideal[:, 1], -ideal[:, 0], ideal[:, 2]], axis=1)
     assert np.abs(scene.converter_input(acting, scene.t_s)[:, GYRO] - expected).max() < EXACT
+    added = {"accel_scale": np.ones(3), "gyro_g_sensitivity": 0.1 * np.eye(3).ravel(), "gyro_bias_step": [1.0, 2.0, 3.0, -1.0]}
+    acting = [*acting, *((CATALOGUE[name], np.array(theta)) for name, theta in added.items())]
+    force = np.stack([ideal[:, 4], -ideal[:, 3], ideal[:, 5]], axis=1)
+    expected += 0.1 * force + np.array([1.0, 2.0, 3.0])
+    assert np.abs(scene.converter_input(acting, scene.t_s)[:, GYRO] - expected).max() < EXACT
 
 
 def test_a_late_clock_reads_the_motion_of_that_time(scene: Scene) -> None:

@@ -82,6 +82,18 @@ def test_axis_and_seconds_are_those_in_which_it_acts(column: int) -> None:
     assert one.p_value == (1e-9 if column < 3 else 1e-7)
 
 
+@pytest.mark.parametrize(("begins_s", "words"), [(12.6, "after 12 s"), (27.3, "after 27 s")])
+def test_what_sets_in_is_there_from_then_on_also_before_the_middle_of_a_log(begins_s: float, words: str) -> None:
+    """The median took off what had set in: a scale from 12.6 s on was always there, and one from 27.3 s on from 27 s on."""
+    misfit = NOTHING + 0.1  # the best constant is of both parts
+    misfit[:, 4] += np.where(begins_s > T, 0.0, 0.1 * (9.81 + np.sin(T)))
+    misfit[:, 1] += np.where(begins_s > T, 0.0, 0.1)  # and a step of a bias
+    found = locate(T, misfit, NOISE, {"time": ("s", T)}, {})
+    assert [(one.axes, one.regime) for one in found] == [(("y",), words)] * 2
+    for one in found:
+        assert np.array(one.intervals_s) == pytest.approx(np.array([[begins_s, DURATION_S]]))
+
+
 def test_intervals_are_on_the_clock_that_is_given() -> None:
     (one,) = locate(T + 5.0, acting(4, (T >= 12.0) & (T < 19.0)), NOISE, {}, {})
     assert one.intervals_s == ((17.0, 24.0),)

@@ -588,6 +588,17 @@ def test_scale_misalignment_and_square_are_what_their_equations_say(sensor: str)
     close(getattr(act(f"{sensor}_misalignment", taken, *m), sensor), np.array([row + M @ row for row in x]))
 
 
+def test_no_scale_acts_on_what_is_added_and_a_gyro_feels_the_force_as_it_is() -> None:
+    """A step beside a scale, and a sensitivity beside an accelerometer's scale, were off by their product: five deviations."""
+    taken = lively().sample(clock(), clock())
+    s, added, G_xz = np.full(3, 0.05), np.array([0.2, 0.3, 0.4]), np.array([0.0, 0.0, 1e-3, *[0.0] * 6])
+    names = {"gyro_scale": s, "accel_scale": s, "gyro_g_sensitivity": G_xz}
+    names |= {f"{sensor}_bias_step": [*added, -1.0] for sensor in ("gyro", "accel")}
+    after = distort(taken, [(only(name), np.asarray(theta)) for name, theta in names.items()])
+    close(after.gyro, 1.05 * taken.gyro + added + np.outer(1e-3 * taken.accel[:, 2], [1.0, 0.0, 0.0]))
+    close(after.accel, 1.05 * taken.accel + added)
+
+
 def test_force_turns_a_gyro_by_its_sensitivity() -> None:
     taken = still().sample(clock(1.0), clock(1.0))
     g = np.arange(9.0) * 1e-3

@@ -1,4 +1,4 @@
-"""Sensitivity of the gyro to specific force: + G f."""
+"""Sensitivity of the gyro to specific force, as it is and not as it is read: + G f."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from imutool.sensor.samples import SensorSamples
 
 
 def _forward(samples: SensorSamples, g: Theta) -> SensorSamples:
-    return samples.with_readings(gyro=samples.gyro + (g.reshape(3, 3) @ samples.accel.T).T)
+    return samples.with_readings(gyro=samples.gyro + (g.reshape(3, 3) @ samples.at.accel.T).T)
 
 
 EFFECT = Effect(

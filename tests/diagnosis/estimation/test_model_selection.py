@@ -26,7 +26,7 @@ from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.estimation.trial import verdicts
 from imutool.diagnosis.estimation.trial.lag_start import with_delay_of_accel, with_filter_of_each_sensor
 from imutool.diagnosis.estimation.trial.selection import Selection
-from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
+from imutool.diagnosis.estimation.trial.walking_bias import std_of_unseen_walk, with_bias_walk
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked
 from imutool.sensor import catalogue
@@ -217,6 +217,19 @@ def test_an_effect_is_found_with_its_uncertainty_beside_a_bias_that_walks() -> N
     found = asked(walking({"accel_scale": SINGLE["gyro_scale"]}, 1), beyond=False)
     assert names(found) == ["accel_scale"]
     assert sure(found, "accel_scale", SINGLE["gyro_scale"])
+
+
+def test_sizes_are_as_unsure_as_a_walk_too_slow_to_be_found_makes_them() -> None:
+    """Deviations by the white noise alone are two to five times too small: the rate's corner is at one turn of the log."""
+    felt, step, off = planted.shaken(duration_s=WALK_S), [0.02, -0.01, 0.03, 25.0], []
+    for seed in range(8):
+        walk = np.cumsum(2.0 * np.pi * 0.02 / planted.RATE_HZ * planted.noise(len(felt.t_s), seed + 50), axis=0)
+        one = planted.pair(felt, {"gyro_bias_step": step}, seed, added=walk)
+        found = fit([planted.weighed(one)], planted.acting({"gyro_bias_step": step}), part="all", hold_onsets=True)
+        std = found.stds()["gyro_bias_step"], std_of_unseen_walk(found)["gyro_bias_step"]
+        off += [((found.chosen[0][1] - step) / s)[:3] for s in (std[0], np.hypot(*std))]
+    white, both = (np.sqrt(np.mean(np.square(off[k::2]))) for k in (0, 1))
+    assert white > 1.5 > both > 0.6, (white, both)
 
 
 def test_a_misfit_that_follows_the_motion_is_no_walk() -> None:

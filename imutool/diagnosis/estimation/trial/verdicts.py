@@ -34,7 +34,7 @@ from imutool.diagnosis.estimation.trial.model_error import (
 )
 from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection
 from imutool.diagnosis.estimation.trial.unseen_time import first_refuted
-from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
+from imutool.diagnosis.estimation.trial.walking_bias import std_of_unseen_walk, with_bias_walk
 from imutool.diagnosis.estimation.unnamed_effects import has_no_size, plausible_part, takes_noise
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
@@ -59,6 +59,7 @@ class Trial:
     progress: Callable[[str], None]
     candidates: Candidates
     onset_std: dict[tuple[str, int], float] = field(default_factory=dict, init=False)
+    walk_std: Mapping[str, Theta] = field(default_factory=dict, init=False)
 
     @property
     def tried(self) -> int:
@@ -82,6 +83,7 @@ class Trial:
                 unseen.end()
                 continue
             whole, self.onset_std = estimate_onsets(now.logs, whole, "all", max(1.0, whole.reduced_chi_square))
+            self.walk_std = std_of_unseen_walk(whole)
             verdicts = self.verdicts(whole, first, unseen)
             unseen.end()
             rates = [*(verdict.false_discovery_rate for verdict in verdicts), 1.0][: len(now.chosen) - first]
@@ -206,6 +208,7 @@ class Trial:
         if scattered is not None:
             log_p = max(log_p, scattered.log_p_value(effect.key, gain[1], len(theta)) + self.candidates.log_choices[effect.key])
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
+        std = np.hypot(std, self.walk_std.get(effect.key, 0.0))
         vague = tuple(unidentified(effect, theta, std, curve=curve))
         return SelectedEffect(effect, theta, std, vague, float(np.exp(max(log_p, -700))), rate, gain[0]) if rate < 1.0 else None
 

@@ -7,10 +7,11 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.special import softmax
 
 from imutool.array_types import Bool, Float64, Int64
-from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.jacobians import Jacobians
+from imutool.diagnosis.estimation.gauss_newton import Fit, direction, fit
+from imutool.diagnosis.estimation.jacobians import Jacobians, bound_slopes
 from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog, settled
 from imutool.noise.bias_walk import WalkLikelihood, walk_likelihood
 
@@ -33,6 +34,36 @@ def with_bias_walk(found: Fit) -> Fit:
         return found
     logs = [replace(log, whiten=replace(log.whiten, walk=walk)) for log, walk in zip(plain, walks, strict=True)]
     return fit(logs, found.chosen, part=found.part, hold_onsets=True)
+
+
+def std_of_unseen_walk(found: Fit) -> dict[str, Axes]:
+    """Deviations that walks of the biases add which the noise does not have, by effect.
+
+    A residual shows a slow walk too little to tell it from none, yet it moves what was fitted as if there were none. Its
+    steps have the mean variance s of all that are looked for, each as likely as the residual says. They sum up, so that the
+    estimate scatters by s C J^T W J C, with W_ij = min(i, j) the covariance of a walk of unit steps.
+    """
+    middle = np.zeros_like(found.covariance)
+    for k, log in enumerate(found.logs):
+        in_noise, rows = log.whiten.walk, log.rows(found.part)
+        for axes, steps, each in _walks(log, found.residuals[k], partial(found.jacobians.on_axis, k)):
+            likely = sum((one.of_any_noise() for one in each), start=np.zeros(len(steps)))
+            if (in_noise is not None and in_noise[axes].any()) or int(np.argmax(likely)) == len(steps) - 1:
+                continue
+            weight = softmax(likely)
+            for axis, one in zip(axes.tolist(), each, strict=True):
+                where, J = found.jacobians.on_axis(k, axis, rows)
+                constant = direction(log.constants[rows, axis])
+                moves = np.zeros((len(where), len(rows)))
+                moves[:, rows] = J - np.outer(J @ constant, constant)
+                moves = np.cumsum(moves[:, ::-1], axis=1)  # by a step at each row, which all later ones keep
+                middle[where[:, None], where] += float(weight @ (steps * one.white())) * moves @ moves.T
+    moved = found.covariance @ middle @ found.covariance
+    out = {}
+    for effect, theta in found.chosen:
+        slopes, own = bound_slopes(effect, theta), moved[found.place(effect.key), found.place(effect.key)]
+        out[effect.key] = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, own, slopes), 0.0))
+    return out
 
 
 def squares_of_walk(found: Fit, like: Fit, *, of_any_speed: bool = False) -> float:
