@@ -61,7 +61,8 @@ class Columns:
                 )
             if not np.isfinite(value).all():
                 row = int(np.argmin(np.isfinite(value).reshape(len(value), -1).all(axis=1)))
-                raise DataError(f"{kind}.{name} row {row} is {value[row].tolist()}", expected="finite numbers")
+                what = f"{kind}.{name} row {row} is {value[row].tolist()}"
+                raise DataError(what, expected="finite numbers", fix="Leave such rows out")
         if len(backward := np.flatnonzero(np.diff(self.t_ns) <= 0)):
             row = int(backward[0]) + 1
             raise DataError(
