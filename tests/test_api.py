@@ -222,6 +222,11 @@ def test_what_cannot_be_is_said(call: Callable[[str], object], said: str, logs: 
         call(str(logs / "flight_1.mcap"))
 
 
+def test_an_empty_name_is_no_model(logs: Path, tmp_path: Path) -> None:
+    with pytest.raises(imutool.ModelError, match="is not a model file"):
+        imutool.debias(logs / "flight_1.mcap", tmp_path / "out.mcap", model="")
+
+
 STILL = imutool.example_recording(1, duration_s=5.0)
 STATIC = imutool.load_model("static")
 ZEROS = np.zeros((2, len(STILL.imu), 3))
