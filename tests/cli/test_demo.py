@@ -112,7 +112,7 @@ def test_raw_files_of_a_flight_convert_back_to_the_same_bits(tmp_path: Path) -> 
     assert back.truth == recording.truth
 
 
-def test_an_interrupted_training_advises_no_option_that_the_demo_has_not(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_interrupted_training_advises_no_option_of_another_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def interrupted(*args: Any, **options: Any) -> None:
         raise KeyboardInterrupt("the same command with `resume` goes on from there")
 

@@ -57,9 +57,9 @@ def test_a_wrong_option_is_told_with_what_serves_its_purpose(tmp_path: Path, imu
     ) == (2, True)
 
 
-@pytest.mark.parametrize("words", ["convert  out/", "fleet info  out", "debias in.mcap out.mcap --model ", "view in.mcap --png "])
+@pytest.mark.parametrize("words", ["convert  out/", "fleet info  out", "debias in out.mcap --model ", "view in.mcap --png "])
 def test_an_empty_word_is_no_path_and_no_model(words: str, tmp_path: Path, imutool: Run) -> None:
-    """"$LOGS", which was not set, was the folder one stood in; with "$MODEL" a log was debiased by another model."""
+    """ "$LOGS", which was not set, was the folder one stood in; with "$MODEL" a log was debiased by another model."""
     done = imutool(*words.split(" "), cwd=tmp_path)
     assert (done.returncode, "an empty word" in done.stderr, list(tmp_path.iterdir())) == (2, True, [])
 

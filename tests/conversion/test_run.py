@@ -165,7 +165,7 @@ def test_an_unknown_format_is_refused_with_the_nearest(source, tmp_path):
 @pytest.mark.parametrize("fix", [False, True])
 @pytest.mark.parametrize("kind", ["log", "euroc"])
 def test_a_pipe_gets_the_log_and_stays_a_pipe(tmp_path: Path, kind: str, fix: bool) -> None:
-    """--fix put a file in place of the pipe, and as root in that of /dev/stdout; a bag's log was then looked for in the pipe."""
+    """--fix put a file in place of the pipe, and as root in that of /dev/stdout; a bag's log was read from the pipe."""
     imutool_api.write(tmp_path / "log", imutool_api.example_recording(duration_s=4.0))
     sequence(tmp_path / "euroc")
     convert(tmp_path / kind, tmp_path / "file.mcap", fix=fix)
