@@ -83,9 +83,7 @@ def train(
     if resume and not kept.exists():
         raise ConfigError("there is no checkpoint", where=kept, fix="Train without `resume`")
     if kept.exists() and not (resume or overwrite):
-        raise ConfigError(
-            "an interrupted training left its checkpoint", where=kept, fix="Give `resume` to go on, or `overwrite`"
-        )
+        raise ConfigError("interrupted training left its checkpoint", where=kept, fix="Give `resume` to go on, or `overwrite`")
     if method == static.Model.method:
         raise ConfigError("static is not trained", where="method", fix="Choose hybrid, neural_ode, conv or linear")
     check_device(device)
