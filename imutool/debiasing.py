@@ -247,7 +247,8 @@ def _debias(
     derived, starts, models, records, fits = [], {}, {}, {}, {}
     with SourceDigest(log.index, source) as digest:
         for topic in topics:
-            name, survey = given.get(topic) or given.get("") or model_choice.model_of_log(log, topic), surveys.get(topic)
+            named, survey = given.get(topic, given.get("")), surveys.get(topic)
+            name = model_choice.model_of_log(log, topic) if named is None else named
             wrong = model_choice.warn_of_log(log, topic) if survey is None else []
             how = (options.init, options.smooth, survey, options.force)
             chosen, start = model_choice.choose_model_and_start(log, topic, name, *how)

@@ -222,6 +222,11 @@ def test_what_cannot_be_is_said(call: Callable[[str], object], said: str, logs: 
         call(str(logs / "flight_1.mcap"))
 
 
+def test_an_empty_name_is_no_model(logs: Path, tmp_path: Path) -> None:
+    with pytest.raises(imutool.ModelError, match="is not a model file"):
+        imutool.debias(logs / "flight_1.mcap", tmp_path / "out.mcap", model="")
+
+
 STILL = imutool.example_recording(1, duration_s=5.0)
 STATIC = imutool.load_model("static")
 ZEROS = np.zeros((2, len(STILL.imu), 3))
@@ -401,6 +406,7 @@ def test_results_print_briefly(logs: Path) -> None:
     for result in (*results, imutool.OnlineDebiaser(model)):
         assert len(repr(result)) < 500
         assert "array(" not in repr(result)
+    assert copy.deepcopy(results[2]) != results[2]  # the comparison of its arrays has no one truth value
 
 
 @pytest.mark.parametrize(("unit_ns", "told"), [(1_000_000_000, "have 2 stamps, 1 ns apart"), (10**18, "have one stamp")])

@@ -60,7 +60,7 @@ class NoRestError(DataError):
     """No rest in the log, and an untrained model: nothing determines the bias."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class InitialBias:
     """Rest bias (gyro rad/s, accel m/s²) with standard deviation, and its source in words.
 

@@ -14,6 +14,7 @@ from imutool.cli.terminal import say, tell_error, tell_warning
 from imutool.config import entries
 from imutool.conversion import Failure
 from imutool.errors import LOST, DataError
+from imutool.mcap_io.storage.local import is_stream
 from imutool.report import Report
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ def _tell(report: ConvertReport, common: Common) -> None:
         for path in report.written:
             say(str(path))
     if not common.quiet:
-        bare = [path for path in report.written if path.suffix.lower() != ".mcap"]
+        bare = [path for path in report.written if path.suffix.lower() != ".mcap" and not is_stream(path)]
         asked = [f"{path} is a log, although its name does not end in .mcap; for a folder add a slash" for path in bare]
         for note in [*_grouped(report.notes), *asked]:
             tell_warning(note, "note")

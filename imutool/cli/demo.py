@@ -94,7 +94,11 @@ def run(
     convert(raw, logs, format="euroc", sequences=names, overwrite=overwrite)
     say(f"3. Training the neural ODE on {len(TRAINING_SEEDS)} of them: {model}")
     training = [logs / f"{name}.mcap" for name in names[:-1]]
-    train(training, model, method="neural_ode", settings=TrainSettings(steps=STEPS), overwrite=overwrite, progress=progress)
+    settings = TrainSettings(steps=STEPS)
+    try:
+        train(training, model, method="neural_ode", settings=settings, overwrite=overwrite, progress=progress)
+    except KeyboardInterrupt as interrupt:  # it advises `resume`, which the demo has not
+        raise KeyboardInterrupt from interrupt
     say(f"4. Debiasing the one it has not seen, without its truth: {debiased}")
     debias(log, debiased, model=model, overwrite=overwrite)
     say("5. Measuring against the truth, drawing")

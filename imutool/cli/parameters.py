@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from typer import BadParameter
 from typer.core import TyperGroup
 
 from imutool.errors import ConfigError, ImutoolError
@@ -143,6 +144,8 @@ class PlainValue:
         if self._kind is None and value == param.default:
             return value
         words = value if isinstance(value, list | tuple) else [value]
+        if "" in words and value != param.default:  # as a path it would be this folder, and as a model none
+            raise BadParameter("an empty word; a variable of the shell may not be set", ctx=ctx, param=param)
         unreadable = self._kind is Path and any(Path(word).exists() and not os.access(word, os.R_OK) for word in words)
         if self._kind is None or unreadable or not all(isinstance(word, str | Path) for word in words):
             return self._otherwise().coerce(value, param=param, ctx=ctx)

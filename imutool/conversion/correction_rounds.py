@@ -27,6 +27,7 @@ from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.output_conflicts import refuse_existing
+from imutool.mcap_io.storage.target import copy_file
 from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES
 from imutool.recording.message_log import Message, MessageLog
 
@@ -126,7 +127,7 @@ def write_corrected(
         rounds, kept = _rounds(log, wanted)
     kept = [*dict.fromkeys([*refused, *kept]), *_unjudged_poses(log)]
     if not rounds:
-        log.replace(target)
+        copy_file(log, target, overwrite=overwrite)
         return (*kept,) or ("the motion shows nothing to correct",), Corrections()
     content = _content(log)
     for found in rounds:

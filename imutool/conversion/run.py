@@ -22,7 +22,7 @@ from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, SUFFIX, ConvertReport, Job, Progress, check_targets, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
 from imutool.file_location import local
-from imutool.mcap_io.storage.local import removed_if_empty
+from imutool.mcap_io.storage.local import is_stream, removed_if_empty
 from imutool.processes.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
@@ -81,14 +81,16 @@ def convert(
 
     Raises:
         DataError: no converter recognises anything in the source.
-        ConfigError: unknown format or sequence, two of one name, a target that exists or cannot be made.
+        ConfigError: unknown format or sequence, a pipe, two of one name, a target that exists or cannot be made.
         ImutoolError: the only sequence there is (or was asked for) failed; of several, failures go to the report.
     """
     labels = Labels(sensor, parse_kinds(kinds), parse_pair(imu))
     corrected = tuple(name for name, asked in ((CONVENTIONS, fix), (STAMPS, restamp)) if asked)
     ways = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
-        return _from_stream(module, source, out, sequences, ways, progress)
+        return _from_stream(module, source, out, sequences, replace(ways, converter=format), progress)
+    if is_stream(source) and not source.is_file():  # its reader would wait, and a converter reads it more than once
+        raise ConfigError("is a pipe or a device", where=source, expected="a file or a folder", fix="Write it to a file first")
     if is_pointer(source):
         raise nothing_found(source, packed=False)
     found = _find(source, format, Path(out))
@@ -234,7 +236,7 @@ def _targets(names: Sequence[str], out: str | Path, *, many: bool) -> list[Path]
         ConfigError: several logs but `out` names a file, it is a URL or a stream, or a folder cannot be made.
     """
     slash, out = str(out).endswith(("/", os.sep)), local(str(out), "out")
-    if many and (out.suffix.lower() == SUFFIX or out.is_file()):
+    if many and (out.suffix.lower() == SUFFIX or out.is_file() or is_stream(out)):
         some = ", ".join([*names[:3], *["..."][: len(names) > 3]])
         raise ConfigError(f"several sequences do not fit into one file ({some})", where=out, expected="a folder")
     into_folder = many or slash or out.is_dir()
@@ -271,8 +273,12 @@ def _from_stream(
     report = ConvertReport()
     for recording in chain(first, recordings):
         (target,) = _targets([recording.name], out, many=len(first) > 1)
+        if target in report.written:
+            what, fix = f"two sequences are named {recording.name}", "Its converter has to tell them apart"
+            raise ConfigError(what, where=source, fix=fix)
+        check_targets([job := replace(ways, sequence=recording, target=target)], source)
         kept = replace(recording, frames={}) if isinstance(recording, Recording) and not ways.images else recording
-        report.add(target, write_content(kept, replace(ways, target=target)))
+        report.add(target, write_content(kept, job))
         if progress is not None:
             progress(len(report.written), len(report.written), recording.name)
     missing = set(wanted) - {path.stem for path in report.written} if len(first) > 1 else set(wanted) - {first[0].name}

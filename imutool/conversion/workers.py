@@ -24,7 +24,8 @@ from imutool.mcap_io.codec.joined_imu import JOIN_VECTORS
 from imutool.mcap_io.codec.records import MAGIC
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.storage.target import writing
+from imutool.mcap_io.storage.local import is_stream
+from imutool.mcap_io.storage.target import copy_file, writing
 from imutool.mcap_io.write import write
 from imutool.processes.worker_pool import WorkerBugError, WorkerPool
 from imutool.recording import Recording
@@ -169,6 +170,12 @@ def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
     Raises:
         ImutoolError: it cannot be written.
     """
+    if is_stream(job.target):  # what is written is read again, which a stream does not allow
+        with TemporaryDirectory() as folder:
+            recorded = Path(folder) / job.target.with_suffix(SUFFIX).name
+            outcome = write_content(content, replace(job, target=recorded))
+            copy_file(recorded, job.target, overwrite=True)
+            return outcome
     if job.correct:
         with writing(job.target):
             holder = TemporaryDirectory(prefix=".imutool-", dir=job.target.parent)
@@ -232,6 +239,8 @@ def check_targets(jobs: Sequence[Job], source: Path) -> None:
         sources = getattr(job.sequence, "path", None), source if source.is_file() else None, *_other_files(job)
         if any(path is not None and _is_part_of(job.target, path) for path in sources):
             raise ConfigError("is the source itself", where=job.target, expected="another `out`")
+        if is_stream(job.target):
+            continue
         if job.target.exists() and not job.overwrite:
             raise ConfigError("exists", where=job.target, fix="Choose another `out`, or add `overwrite`")
         if (

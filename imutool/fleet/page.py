@@ -187,7 +187,7 @@ def _outliers(comparison: Comparison) -> Iterator[str]:
             f"<tr><td>{text(row.label)}</td><td class=number>{text(row.text)}</td><td class=number>{row.robots}</td></tr>"
             for row in comparison.shared
         )
-        yield f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+        yield f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
     if comparison.effects:
         yield "<h2>What else was found</h2>"
         rows = "".join(

@@ -68,7 +68,7 @@ class Imu(Columns):
 class Poses(Columns):
     """Poses of the body in the world (m); `q_wb` takes body vectors to world.
 
-    World velocity (m/s) if known.
+    World velocity (m/s) if known. Orientations alone have positions that are all zero.
     """
 
     t_ns: Times

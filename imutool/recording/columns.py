@@ -55,13 +55,12 @@ class Columns:
             if value is None:
                 continue
             if value.shape != (len(self.t_ns), *tail):
-                raise DataError(
-                    f"{kind}.{name} is {value.dtype}{list(value.shape)}",
-                    expected=f"float64{[len(self.t_ns), *tail]}",
-                )
+                what = f"{kind}.{name} is {value.dtype}{list(value.shape)}"
+                raise DataError(what, expected=f"float64{[len(self.t_ns), *tail]}")
             if not np.isfinite(value).all():
                 row = int(np.argmin(np.isfinite(value).reshape(len(value), -1).all(axis=1)))
-                raise DataError(f"{kind}.{name} row {row} is {value[row].tolist()}", expected="finite numbers")
+                what, fix = f"{kind}.{name} row {row} is {value[row].tolist()}", "Leave such rows out"
+                raise DataError(what, expected="finite numbers", fix=fix)
         if len(backward := np.flatnonzero(np.diff(self.t_ns) <= 0)):
             row = int(backward[0]) + 1
             raise DataError(

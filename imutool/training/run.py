@@ -25,6 +25,7 @@ from imutool.bias_start.stretches import within_range
 from imutool.config import plain
 from imutool.errors import ConfigError
 from imutool.log_info.convention_report import check_conventions
+from imutool.mcap_io.storage.local import is_stream
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.training import checkpoint
@@ -68,10 +69,12 @@ def train(
     """Train a model on logs of one sensor and write it; `resume` continues from a checkpoint.
 
     Raises:
-        ConfigError: the target exists, unknown method or settings, or a checkpoint of another training.
+        ConfigError: the target exists or is a pipe, unknown method or settings, or a checkpoint of another training.
         ConfigError, LogError, DataError: a log without IMU, measurements or truth, different rates, too little to train on.
         NumericsError: the loss diverged.
     """
+    if is_stream(out):
+        raise ConfigError("is a pipe or a device", where=out, expected="a file, beside which the checkpoint lies")
     if out.exists() and not overwrite:
         raise ConfigError("exists already", where=out, fix="Choose another name or give `overwrite`")
     if not out.parent.is_dir():
@@ -80,8 +83,7 @@ def train(
     if resume and not kept.exists():
         raise ConfigError("there is no checkpoint", where=kept, fix="Train without `resume`")
     if kept.exists() and not (resume or overwrite):
-        message = "an interrupted training left its checkpoint"
-        raise ConfigError(message, where=kept, fix="Give `resume` to go on, or `overwrite` to start afresh")
+        raise ConfigError("interrupted training left its checkpoint", where=kept, fix="Give `resume` to go on, or `overwrite`")
     if method == static.Model.method:
         raise ConfigError("static is not trained", where="method", fix="Choose hybrid, neural_ode, conv or linear")
     check_device(device)
@@ -159,8 +161,7 @@ def _physics_first(
     physics = PhysicsFirst.of(recordings, settings, descent.device, descent.say)
     alone = msgspec.structs.replace(settings, model={})
     without = descent(physics.recordings, static.Model.method, alone)
-    compared: dict[str, Any] = {}
-    constant, fits = set[Sensor](), physics.fits
+    compared, constant, fits = dict[str, Any](), set[Sensor](), physics.fits
     if settings.compare:
         descent.say(note("scoring left-out logs"))
         pool = Pool.of(recordings, floors=settings.pose_floors)
@@ -241,8 +242,7 @@ def _described(fits: Mapping[Sensor, Calibration]) -> dict[str, Any]:
 
 def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent) -> tuple[BiasNetwork, dict[str, Any]]:
     """A matrix for each sensor whose matrix helps left-out logs; the card's entries."""
-    compared: dict[str, Any] = {}
-    constant = set[Sensor]()
+    compared, constant = dict[str, Any](), set[Sensor]()
     if settings.compare:
         descent.say(note("scoring left-out logs"))
         names = {f"{sensor}_effects": LINEAR[sensor] for sensor in SENSORS}

@@ -110,3 +110,14 @@ def test_raw_files_of_a_flight_convert_back_to_the_same_bits(tmp_path: Path) -> 
     (back,) = euroc.read(tmp_path / "flight_7")
     assert back.imu == recording.imu
     assert back.truth == recording.truth
+
+
+def test_an_interrupted_training_advises_no_option_of_another_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def interrupted(*args: Any, **options: Any) -> None:
+        raise KeyboardInterrupt("the same command with `resume` goes on from there")
+
+    monkeypatch.setattr("imutool.training.run.train", interrupted)
+    monkeypatch.setattr("imutool.conversion.run.convert", lambda *args, **options: None)
+    monkeypatch.setattr(demo, "write_asl", lambda *args: None)
+    with pytest.raises(KeyboardInterrupt, match=r"^$"):
+        demo.run(tmp_path / "out", lambda line: None)

@@ -57,6 +57,13 @@ def test_a_wrong_option_is_told_with_what_serves_its_purpose(tmp_path: Path, imu
     ) == (2, True)
 
 
+@pytest.mark.parametrize("words", ["convert  out/", "fleet info  out", "debias in out.mcap --model ", "view in.mcap --png "])
+def test_an_empty_word_is_no_path_and_no_model(words: str, tmp_path: Path, imutool: Run) -> None:
+    """ "$LOGS", which was not set, was the folder one stood in; with "$MODEL" a log was debiased by another model."""
+    done = imutool(*words.split(" "), cwd=tmp_path)
+    assert (done.returncode, "an empty word" in done.stderr, list(tmp_path.iterdir())) == (2, True, [])
+
+
 def test_help_and_a_command_import_what_they_need() -> None:
     seen = {"numpy", "typer", "scipy", "pydantic", "imutool.cli.train", "rich.progress"}
     assert loaded_by_command(["--help"], seen) == []

@@ -7,6 +7,7 @@ import signal
 import tarfile
 import types
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -161,9 +162,33 @@ def test_an_unknown_format_is_refused_with_the_nearest(source, tmp_path):
         convert(source, tmp_path / "out", format="eurok")
 
 
+<<<<<<< HEAD
 @pytest.mark.parametrize(
     "kind", ["empty folder", "folder of notes", "folder of arrays", "text file", "empty file", "header alone"]
 )
+=======
+@pytest.mark.parametrize("fix", [False, True])
+@pytest.mark.parametrize("kind", ["log", "euroc"])
+def test_a_pipe_gets_the_log_and_stays_a_pipe(tmp_path: Path, kind: str, fix: bool) -> None:
+    """--fix put a file in place of the pipe, and as root in that of /dev/stdout; a bag's log was read from the pipe."""
+    imutool_api.write(tmp_path / "log", imutool_api.example_recording(duration_s=4.0))
+    sequence(tmp_path / "euroc")
+    convert(tmp_path / kind, tmp_path / "file.mcap", fix=fix)
+    os.mkfifo(pipe := tmp_path / "pipe")
+    with ThreadPoolExecutor() as threads:
+        read_bytes = threads.submit(pipe.read_bytes)
+        convert(tmp_path / kind, pipe, fix=fix)
+        assert read_bytes.result(30.0) == (tmp_path / "file.mcap").read_bytes()
+    assert pipe.is_fifo()
+    sequence(tmp_path / "another")
+    with pytest.raises(ConfigError, match="do not fit into one file"):
+        convert(tmp_path, pipe)
+    with pytest.raises(ConfigError, match="is a pipe or a device"):
+        convert(pipe, tmp_path / "out.mcap")
+
+
+@pytest.mark.parametrize("kind", ["empty folder", "folder of notes", "text file", "empty file", "header alone"])
+>>>>>>> hour
 def test_where_nothing_is_recognised_the_message_says_what_was_looked_for(tmp_path, kind):
     source = tmp_path / "source"
     texts = {"text file": "notes", "empty file": "", "header alone": "time,gx,gy,gz,ax,ay,az\n"}
@@ -353,6 +378,12 @@ def test_a_converter_that_only_reads_is_used_on_request(outside, tmp_path):
     assert convert(tmp_path / "list.txt", tmp_path / "y.mcap", format="outside", sequences=["y"]).written
     with pytest.raises(DataError, match="no sequence found"):
         convert(tmp_path / "list.txt", tmp_path / "out2")
+    with pytest.raises(ConfigError, match="is the source itself"):
+        convert(tmp_path / "list.txt", tmp_path / "list.txt", format="outside", sequences=["y"], overwrite=True)
+    assert (tmp_path / "list.txt").read_text() == "x y"
+    (tmp_path / "list.txt").write_text("x x")
+    with pytest.raises(ConfigError, match="two sequences are named x"):
+        convert(tmp_path / "list.txt", tmp_path / "out", format="outside", overwrite=True)
 
 
 def test_what_two_converters_claim_must_be_decided(source, tmp_path, monkeypatch, outside):

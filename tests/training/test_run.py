@@ -277,6 +277,8 @@ def test_refusals_come_before_the_work_and_leave_nothing(
         train(logs, there, method="neural_ode", settings=TINY)
     with pytest.raises(ConfigError, match="the folder does not exist"):
         train(logs, tmp_path / "no" / "m.safetensors", method="neural_ode", settings=TINY)
+    with pytest.raises(ConfigError, match="is a pipe or a device"):
+        train(logs, Path("/dev/stdout"), method="linear", overwrite=True)
     blind = tmp_path / "blind.mcap"
     write(Recording("blind", flight(3, duration_s=2.0).imu), blind)
     with pytest.raises(DataError, match="blind: no true poses"):

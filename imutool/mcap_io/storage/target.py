@@ -128,6 +128,17 @@ class Target:
         self._remove()
 
 
+def copy_file(source: Path, target: Location, *, overwrite: bool) -> None:
+    """Copy a file.
+
+    Raises:
+        ConfigError: the target exists (without `overwrite`), or the system refuses to write.
+    """
+    opened = Source(source)
+    with opened.file, Target(target, overwrite=overwrite, summing=False) as out:
+        out.copy(opened, 0, opened.size)
+
+
 def _medium(path: Location) -> LocalFile | Upload:
     if not isinstance(path, Path):
         return Upload(path, f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
@@ -194,9 +205,9 @@ class FolderTarget:
     def __init__(self, path: Path, log: Path, *, signed: str, holds: str, overwrite: bool) -> None:
         self.path, self.log, self.overwrite = path.absolute(), log, overwrite
         self.signed, self.holds = signed, holds
+        self.temporary = temporary_path(self.path)
         self._refuse_existing()
         remove_abandoned(self.path)
-        self.temporary = temporary_path(self.path)
         self._remove = weakref.finalize(self, shutil.rmtree, self.temporary, True)
         with writing(path):
             self.temporary.mkdir()
@@ -222,7 +233,7 @@ class FolderTarget:
 
     def _makes(self, entry: Path) -> bool:
         """Whether an entry is a file, or a folder that is written again, as far as that is known yet."""
-        if not hasattr(self, "temporary") or not (self.path / entry).is_dir():
+        if not self.temporary.is_dir() or not (self.path / entry).is_dir():
             return True
         return (self.temporary / entry).is_dir() and not (self.path / entry).is_symlink()
 

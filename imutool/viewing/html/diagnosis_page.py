@@ -236,8 +236,8 @@ def _left(d: Diagnosis) -> Iterator[str]:
             ratio = f"{residual.rms / residual.noise_floor:.2f}" if residual.noise_floor > 0.0 else "–"
             numbers = (f"{residual.rms:.3g} {unit}", f"{residual.noise_floor:.3g} {unit}", ratio)
             cells = "".join(f"<td class=number>{text(number)}</td>" for number in numbers)
-            rows.append(f"<tr><td>{text(signal)}</td>{cells}<td>{text(residual_text(residual, unit))}</td></tr>")
-        yield f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+            rows.append(f"<tr><td>{text(signal)}</td>{cells}<td class=sentence>{text(residual_text(residual, unit))}</td></tr>")
+        yield f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
     if d.closer and d.findings:
         yield f"<h2>Improvement</h2><p class=note>{text(gain_source(d) + held_out_time(d))}.</p><dl>"
         for signal, again in d.closer.items():

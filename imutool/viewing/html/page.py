@@ -137,6 +137,7 @@ th, td { text-align: left; vertical-align: top; padding: 6px 12px 6px 0; border-
 th { font-weight: 600; color: var(--soft); white-space: nowrap; }
 .findings { table-layout: fixed; min-width: 900px; }
 .findings th:nth-child(1) { width: 38%; } .findings th:nth-child(2) { width: 27%; } .findings th:nth-child(4) { width: 12%; }
+td.sentence { min-width: 12em; }
 td.number, .entry { white-space: nowrap; font-variant-numeric: tabular-nums; }
 code { font: 13px/1.4 ui-monospace, "DejaVu Sans Mono", monospace; }
 figure { margin: 10px 0 0; break-inside: avoid; }

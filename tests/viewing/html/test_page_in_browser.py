@@ -21,6 +21,7 @@ TESTS = Path(__file__).parents[1]
 
 WIDE, NARROW, PAPER = 1280, 400, 794  # CSS pixels; the last is A4 at 96 dots per inch
 HEIGHT = 720
+SENTENCE = 60  # CSS pixels: in a narrower cell a sentence stands letter by letter
 READABLE = 4.5  # contrast of text, the least that WCAG 2 calls AA
 INKED = 0.002  # of a figure's area: frame and labels alone reach it, an empty box does not
 ADDRESSED = "http://127.0.0.1:9/elsewhere.png"  # nobody listens there
@@ -106,6 +107,8 @@ def test_a_page_says_nothing_asks_for_nothing_and_fits(visit: Any, folder: Path,
     assert one.said == []
     assert one.asked == [path.as_uri()]
     assert fits(one)
+    cells = "[...document.querySelectorAll('td')].filter(cell => cell.checkVisibility() && cell.textContent.length > 20)"
+    assert min(one.numbers(f"{cells}.map(cell => cell.getBoundingClientRect().width)"), default=NARROW) > SENTENCE
 
 
 def test_what_says_asks_and_does_not_fit_is_seen(visit: Any, tmp_path: Path) -> None:
