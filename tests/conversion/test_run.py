@@ -162,11 +162,6 @@ def test_an_unknown_format_is_refused_with_the_nearest(source, tmp_path):
         convert(source, tmp_path / "out", format="eurok")
 
 
-<<<<<<< HEAD
-@pytest.mark.parametrize(
-    "kind", ["empty folder", "folder of notes", "folder of arrays", "text file", "empty file", "header alone"]
-)
-=======
 @pytest.mark.parametrize("fix", [False, True])
 @pytest.mark.parametrize("kind", ["log", "euroc"])
 def test_a_pipe_gets_the_log_and_stays_a_pipe(tmp_path: Path, kind: str, fix: bool) -> None:
@@ -187,8 +182,9 @@ def test_a_pipe_gets_the_log_and_stays_a_pipe(tmp_path: Path, kind: str, fix: bo
         convert(pipe, tmp_path / "out.mcap")
 
 
-@pytest.mark.parametrize("kind", ["empty folder", "folder of notes", "text file", "empty file", "header alone"])
->>>>>>> hour
+@pytest.mark.parametrize(
+    "kind", ["empty folder", "folder of notes", "folder of arrays", "text file", "empty file", "header alone"]
+)
 def test_where_nothing_is_recognised_the_message_says_what_was_looked_for(tmp_path, kind):
     source = tmp_path / "source"
     texts = {"text file": "notes", "empty file": "", "header alone": "time,gx,gy,gz,ax,ay,az\n"}
