@@ -200,16 +200,6 @@ class StampCheck:
             )
         self.count, self.last = self.count + len(stamp_ns), int(stamp_ns[-1])
 
-    def check_imu(self, batch: ImuBatch) -> None:
-        """Takes in the next samples of an IMU.
-
-        Raises:
-            LogError: NaN, infinity, or a stamp that does not come after the one before it.
-        """
-        check_finite(batch, CLEAN_FIX, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
-        self.fix = CLEAN_FIX
-        self.check(batch.stamp_ns, batch.sequence)
-
 
 def topics_of(index: LogIndex) -> dict[str, Topic]:
     """The topics of a log by their names, in order of their channel ids.
