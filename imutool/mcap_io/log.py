@@ -55,7 +55,6 @@ class Log:
         self._source = path if isinstance(path, Source) else Source(location(path))
         self._owns_source, self.path = True, self._source.path
         self.kept: KeptChunks | None = None
-        self._begun: tuple[MessageBlock, messages.Messages | None] | None = None
         self._ids = (0, 0), dict[str, set[int]]()  # channels by topic, of an index and so many channels
         try:
             with self.named():
@@ -69,9 +68,9 @@ class Log:
         return LogIndex(source, self.max_chunk)
 
     def _read_topics(self) -> None:
-        """Reads the topics from the index; IMUs of other types may need the first message of a topic."""
+        """Reads the topics from the index; IMUs of other types may need the first messages."""
         self.topics = MappingProxyType(topics_of(self.index))
-        self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, self.first)})
+        self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, self.firsts)})
 
     def __enter__(self) -> Log:
         return self
@@ -236,16 +235,20 @@ class Log:
             with self.named(topic):
                 yield from described.decode_poses(rows)
 
-    def first(self, topic: str) -> bytes | None:
-        """First message of a topic; its chunk stays unpacked until `rows`, as many topics begin in one."""
-        channels = self.channel_ids(topic)
-        with self.named(topic):
-            for block in (block for block in self.index.blocks if block.may_hold(channels)):
-                if self._begun is None or self._begun[0] is not block:
-                    self._begun = block, self.index.unpack_or_lose(block)
-                for _, rows in self._cut(self._begun[1], {topic: channels}) if self._begun[1] else ():
-                    return bytes(rows.payload[0])
-        return None
+    def firsts(self, topics: Collection[str]) -> dict[str, bytes]:
+        """First messages of some topics, in a pass that ends with the last of them."""
+        wanted, found = {channel: topic for topic in topics for channel in self.channel_ids(topic)}, dict[str, bytes]()
+        channels = set(wanted)
+        with self.named():
+            for block in (block for block in self.index.blocks if channels and block.may_hold(channels)):
+                if (read := self.index.unpack_or_lose(block)) is None:
+                    continue
+                for channel, table in sorted(read.entries(channels).items(), key=lambda entries: int(entries[1][0, 1])):
+                    at = int(table[0, 1])
+                    end = at + HEAD.size + HEAD.unpack_from(read.data.data, at)[1]
+                    found.setdefault(wanted[channel], read.data[at + messages.MESSAGE.itemsize : end].tobytes())
+                channels = {channel for channel in channels if wanted[channel] not in found}
+        return found
 
     def channel_ids(self, topic: str) -> set[int]:
         """Channels of a topic; for a joined IMU those of its gyroscope."""
@@ -265,7 +268,6 @@ class Log:
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[tuple[str, messages.Rows]]:
         """The messages of some topics in file order; each chunk is unpacked once for all topics."""
-        self._begun = None  # one chunk in memory
         wanted = {topic: self.channel_ids(topic) for topic in topics}
         every = set().union(*wanted.values()) if wanted else set()
         first, last = -1 if start_ns is None else start_ns, 2**63 - 1 if end_ns is None else end_ns

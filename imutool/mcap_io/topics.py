@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
@@ -225,25 +225,26 @@ def topics_of(index: LogIndex) -> dict[str, Topic]:
     return found
 
 
-def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callable[[str], bytes | None]) -> dict[str, Topic]:
+def reflected_topics(
+    index: LogIndex, topics: Mapping[str, Topic], firsts: Callable[[Collection[str]], Mapping[str, bytes]]
+) -> dict[str, Topic]:
     """IMUs and poses among the topics whose type is not that of ROS.
 
-    `first` gives the first message of a topic.
+    `firsts` gives the first messages of some topics.
     Types of ROS 2 count only where the log has no other recorded IMU: drivers publish their own message beside that of ROS.
     """
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
     found: dict[str, Topic] = {}
-    for name, topic in topics.items():
-        if topic.message_encoding not in REFLECTED or RECORDED_KEY in topic.metadata:
-            continue
+    reflected = {n: t for n, t in topics.items() if t.message_encoding in REFLECTED and RECORDED_KEY not in t.metadata}
+    first = firsts([name for name, topic in reflected.items() if topic.message_encoding == "json"])
+    for name, topic in reflected.items():
         schema = definition.data if (definition := definitions[name]) else b""
         try:
             several = TYPE.fullmatch(topic.schema_name)
             if several and (form := format_of(topic.message_encoding, topic.schema_name, schema)):
                 found[name] = _as_ros(topic, Transforms(form, bool(several[1])))
                 continue
-            raw = first(name) if topic.message_encoding == "json" else None
-            message = reflect(topic.message_encoding, name, topic.schema_name, schema, raw)
+            message = reflect(topic.message_encoding, name, topic.schema_name, schema, first.get(name))
         except ImportError:
             continue
         if message is not None:
