@@ -188,9 +188,9 @@ class SensorStamps(IncreasingStamps):
 
 
 def clocks(stamps_of: StampsOf, counts: Mapping[str, int]) -> Iterator[tuple[int, Clock]]:
-    """Messages and clock of each topic, in as few passes over the log as memory allows; `counts` are the messages expected.
+    """Messages and clock of each topic, in as few passes over the log as memory allows.
 
-    Stamps that repeat or go back come into memory, and are sorted.
+    `counts` are the messages that are expected. Stamps that repeat or go back come into memory, and are sorted.
     """
     group, size = list[str](), 0
     for topic, count in counts.items():

@@ -16,6 +16,7 @@ from mcap.records import MessageIndex
 from mcap.writer import IndexType, Writer
 from support.imu_defects import survey
 
+from imutool.cleaning import CleaningSettings, look
 from imutool.cli.info import imu_rows, topic_rows
 from imutool.conversion.run import convert
 from imutool.converters import fetch, tum_vi
@@ -476,5 +477,7 @@ def test_two_sensors_on_one_topic_are_named(tmp_path: Path, caplog: pytest.LogCa
     said = "the messages name 2 frames: front (1000), rear (999); several sensors have no common bias"
     assert json_values(inspect(path))["imu"][0]["warnings"] == [said]
     assert [(finding.rule, finding.what) for finding in survey(path).findings] == [("frames", said)]
+    with Log(path) as log:
+        assert look(log, "/imu", CleaningSettings(without=("frames",))).score == 1.0
     debias(path, tmp_path / "out.mcap")
     assert f"/imu: {said}" in caplog.text
