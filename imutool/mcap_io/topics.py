@@ -230,8 +230,7 @@ def reflected_topics(
 ) -> dict[str, Topic]:
     """IMUs and poses among the topics whose type is not that of ROS.
 
-    `firsts` gives the first messages of some topics.
-    Types of ROS 2 count only where the log has no other recorded IMU: drivers publish their own message beside that of ROS.
+    `firsts` gives the first messages of some topics. Types of ROS 2 count only where the log has no other recorded IMU: drivers publish their own message beside that of ROS.
     """
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
     found: dict[str, Topic] = {}
@@ -250,19 +249,30 @@ def reflected_topics(
         if message is not None:
             found[name] = _as_ros(topic, message)
     imus = {name: topic for name, topic in {**topics, **found}.items() if topic.schema_name == schemas.IMU}
-    own = {name: definition for name, topic in imus.items() if (definition := definitions[name]) and not topic.reflected}
-    odd = {name for name, definition in own.items() if not ros2_definition.is_imu_of_ros(definition.data)}
+    texts: dict[str, set[bytes]] = {name: set() for name in topics}  # of all channels of a topic
+    for channel in index.channels.values():
+        texts[channel.topic] |= {index.schemas[channel.schema_id].data} if channel.schema_id in index.schemas else set()
+    odd = {n for n, t in imus.items() if not t.reflected and not all(map(ros2_definition.is_imu_of_ros, texts[n]))}
     known = any(not topic.is_derived for name, topic in imus.items() if name not in odd)
     for name, topic in topics.items():
         described = (topic.schema_encoding, topic.message_encoding, topic.is_derived) == ("ros2msg", "cdr", False)
         definition = definitions[name] if described and (name in odd or not known) else None
-        if definition is not None and (imu := reflect_cdr(topic.schema_name, definition.data)) is not None:
-            texts = {index.schemas[c.schema_id].data for c in index.channels.values() if c.topic == name and c.schema_id}
-            ros2_definition.refuse_two(name, topic.schema_name, [ros2_definition.parse(topic.schema_name, t) for t in texts])
+        imu = None if definition is None else reflect_cdr(topic.schema_name, definition.data)
+        if imu is not None and _have_one_layout(topic, texts[name]):
             found[name] = _as_ros(topic, imu)
-        elif name in odd:  # whose bytes would be read in the order of ROS
-            found[name] = replace(topic, schema_name=f"{topic.schema_name} (another definition)")
+        elif imu is not None or name in odd:  # whose bytes would be read in the order of another
+            which = "two definitions" if len(texts[name]) > 1 else "another definition"
+            found[name] = replace(topic, schema_name=f"{topic.schema_name} ({which})")
     return found
+
+
+def _have_one_layout(topic: Topic, texts: Collection[bytes]) -> bool:
+    try:
+        each = [ros2_definition.parse(topic.schema_name, text) for text in texts]
+        ros2_definition.refuse_two(topic.name, topic.schema_name, each)
+    except LogError:
+        return False
+    return True
 
 
 def _as_ros(topic: Topic, message: Reflected | Transforms) -> Topic:
