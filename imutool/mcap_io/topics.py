@@ -230,7 +230,7 @@ def reflected_topics(
 ) -> dict[str, Topic]:
     """IMUs and poses among the topics whose type is not that of ROS.
 
-    `firsts` gives the first messages of some topics. Types of ROS 2 count only where the log has no other recorded IMU: drivers publish their own message beside that of ROS.
+    `firsts` gives the first messages of some. Types of ROS 2 count only if no other IMU was recorded: drivers publish both.
     """
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
     found: dict[str, Topic] = {}

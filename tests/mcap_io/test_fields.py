@@ -20,8 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.diagnosis.signals.signal_diagnosis import diagnose_signal
 from imutool.errors import LogError
-from imutool.mcap_io.codec import ros2_definition
-from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec import ros2_definition, schemas
 from imutool.mcap_io.fields import numeric_fields, others, read_field
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.repair import repair
