@@ -272,7 +272,8 @@ class Log:
         every = set().union(*wanted.values()) if wanted else set()
         first, last = -1 if start_ns is None else start_ns, 2**63 - 1 if end_ns is None else end_ns
         with self.named():
-            blocks = (b for b in self.index.blocks if b.may_hold(every) and b.start_ns <= last and (b.end_ns or last) >= first)
+            inside = (b for b in self.index.blocks if (end_ns is None or b.start_ns <= last) and (b.end_ns or last) >= first)
+            blocks = (block for block in inside if block.may_hold(every))
             for near in neighbours(blocks) if self.kept is None else ([block] for block in blocks):
                 yield from self._rows_of(near, wanted, first, last)
 

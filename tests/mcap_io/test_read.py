@@ -8,12 +8,14 @@ import re
 import shutil
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.records import Chunk, ChunkIndex
 from mcap.writer import Writer
 
 from imutool.cleaning import raw_batches
@@ -25,6 +27,7 @@ from imutool.mcap_io.file_writer import LogWriter
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read, read_recordings
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, VELOCITY_KEY
 from imutool.mcap_io.write import Series, chunks, write
 from imutool.recording import Imu, Recording
@@ -192,6 +195,19 @@ def test_frames_that_change_within_a_topic_come_as_batches_of_their_own(foreign:
     with Log(foreign(messages)) as log:
         batches = list(raw_batches(log, "/imu"))
     assert [(b.frame_id, len(b.stamp_ns)) for b in batches] == [("a", 5), ("c", 2), ("a", 13)]
+
+
+def test_a_chunk_that_states_times_beyond_any_is_not_left_out(
+    foreign: Foreign, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The IMU had no messages, and nothing was said."""
+    for record in (Chunk, ChunkIndex):
+        whole, late = record.write, partial(replace, message_start_time=2**64 - 1)
+        monkeypatch.setattr(record, "write", lambda self, to, whole=whole, late=late: whole(late(self), to))
+    path = foreign(imu_messages(make))
+    with RecoveredLog(path) as log:
+        assert sum(len(rows.payload) for _, rows in log.rows(["/imu"])) == 20
+    assert len(read(path).imu) == 20
 
 
 def test_a_payload_that_is_no_message_is_refused_by_its_number(foreign: Foreign, make: Make) -> None:
