@@ -135,7 +135,7 @@ def test_a_log_in_a_folder_that_may_be_listed_only_is_told_and_the_others_go_on(
         return asked(path, **options)
 
     monkeypatch.setattr(Path, "stat", stat)
-    found = find(str(tmp_path / pattern), NOWHERE)
+    found = find(str(tmp_path), NOWHERE)
     assert [log.name for log in found.logs] == ["good.mcap"]
     assert [Path(where).name for where, _ in found.refused] == ["a.mcap"]
 
@@ -231,7 +231,7 @@ def test_a_pipe_a_socket_and_a_device_are_told_and_not_opened(tmp_path: Path) ->
     (tmp_path / "device.mcap").symlink_to("/dev/zero")
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(tmp_path / "socket.mcap"))
-        found = find(str(tmp_path / pattern), NOWHERE)
+        found = find(str(tmp_path), NOWHERE)
     assert [log.name for log in found.logs] == ["good.mcap"]
     assert [Path(where).name for where, _ in found.refused] == ["device.mcap", "pipe.mcap", "socket.mcap"]
     assert all("is a pipe, a socket or a device" in why for _, why in found.refused)
