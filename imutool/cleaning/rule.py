@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from typing import Annotated, ClassVar
@@ -74,6 +74,7 @@ class TopicSummary:
     """Totals of a topic after the pass; rules read them in order and may add to them.
 
     Attributes:
+        frames: messages by the frame that they name.
         scale: factors from the log's units to rad/s and m/s², gyro then accel.
         axes: signed permutations that lead from the log's axes to right ones, gyro then accel.
         mount: that which leads from the IMU's axes to the body of the poses; no defect, and only the poses may be turned.
@@ -90,6 +91,7 @@ class TopicSummary:
     messages: int
     motion: Motion
     truth: Truth | None
+    frames: Mapping[str, int] = field(default_factory=dict)
     scale: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.ones(6))
     axes: Float64[np.ndarray, "2 3 3"] = field(default_factory=lambda: np.stack([np.eye(3)] * 2))
     mount: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))

@@ -17,7 +17,7 @@ from imutool.cleaning.finding import Finding, FindingReport, Verdict, score, ver
 from imutool.cleaning.likelihood import axis_names
 from imutool.cleaning.rule import GROUP, CleaningSettings, Rule, TopicSummary
 from imutool.cleaning.rules.gaps import MISSING
-from imutool.cleaning.samples import Motion, Samples, blocks, counted_frames, frame_words
+from imutool.cleaning.samples import Motion, Samples, blocks, counted_frames
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
@@ -209,13 +209,11 @@ def examine(
     """
     settings = settings or CleaningSettings()
     names = settings.names()
-    frames = Counter[str]()
-    stages, whole = _through(counted_frames(each(), frames), truth, settings, {name: _rule(name)() for name in names})
+    stages, whole = _through(each(), truth, settings, {name: _rule(name)() for name in names})
     second = {name: stage.second_pass(whole.messages) for name, stage in stages.items()}
     if any(stage is not None for stage in second.values()):
         stages, whole = _through(each(), truth, settings, {name: second[name] or _rule(name)() for name in names})
-    found = [finding for stage in stages.values() for finding in stage.findings(whole)]
-    findings = (*found, *(Finding("frames", "warning", what, len(frames)) for what in frame_words(frames)))
+    findings = tuple(finding for stage in stages.values() for finding in stage.findings(whole))
     dropped = np.zeros(whole.messages, bool)
     for stage in stages.values():
         for numbers in stage.dropped:
@@ -238,11 +236,11 @@ def _through(
     The second value is the topic's totals.
     """
     stages = dict(sorted(rules.items(), key=lambda item: item[1].place))
-    motion, messages = Motion(), 0
+    motion, messages, frames = Motion(), 0, Counter[str]()
 
     def received() -> Iterator[Samples]:
         nonlocal messages
-        for samples in blocks(batches):
+        for samples in blocks(counted_frames(batches, frames)):
             messages += len(samples.number)
             yield samples
 
@@ -251,7 +249,7 @@ def _through(
         stream = stage(stream)
     for samples in stream:
         motion.see(samples)
-    return stages, TopicSummary(settings, messages, motion, truth)
+    return stages, TopicSummary(settings, messages, motion, truth, frames)
 
 
 @cache

@@ -88,7 +88,7 @@ def _copy(log: Path, copy: Path, tell: Progress) -> None:
 
 def _metadata_yaml(log: Log, name: str) -> str:
     """The text of metadata.yaml; JSON strings are YAML strings."""
-    ends = [(int(t.min()), int(t.max())) for topic in log.topics for t in log.stamps(topic) if len(t)]
+    ends = [(int(t.min()), int(t.max())) for _, t in log.stamps_of(log.topics)]
     start = min((first for first, _ in ends), default=0)
     duration = max((last for _, last in ends), default=0) - start
     total = sum(topic.count for topic in log.topics.values())

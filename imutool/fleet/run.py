@@ -63,7 +63,7 @@ class Progress:
     def line(self, running: int = 0) -> str:
         """Progress line: `12 of 40 done, 1 failed, 2 running, 35 MB/s, 1:20 left`."""
         elapsed = time.perf_counter() - self.began
-        parts = [f"{self.statuses.total()} of {self.logs} done"]
+        parts = [f"{self.statuses.total() - self.statuses['failed']} of {self.logs} done"]
         parts += [
             f"{self.statuses[name]} {name}" for name in ("skipped", "lost", "quarantined", "failed") if self.statuses[name]
         ]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import glob as globs
+import fnmatch
 import logging
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -174,35 +174,58 @@ def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
         return str(absolute(where).parent), iter([_File(str(absolute(where)))])
     if not PATTERN.search(str(where)):
         raise ConfigError("is not there", where=redact(text), expected="a log, a folder with logs, or a pattern")
-    root = Path.cwd()
-    for part in where.parts:
-        if PATTERN.search(part):
-            break
-        root /= part
-    named = sorted(globs.iglob(str(where), recursive=True))  # noqa: PTH207  Path.glob takes no absolute pattern
-    files = (os.path.abspath(name) for name in named)  # noqa: PTH100  Path.resolve would follow links
-    return os.path.abspath(root), (_File(file) for file in files if _ends(file, endings) and Path(file).is_file())  # noqa: PTH100
+    root, parts = Path.cwd(), list(where.parts)
+    while not PATTERN.search(parts[0]):
+        root /= parts.pop(0)
+    fitting = _fitting(root, parts, frozenset()) if is_folder(root) else ()
+    files = {os.path.abspath(file.where): file.unread for file in fitting}  # noqa: PTH100  Path.resolve would follow links
+    found = (_File(where, unread=files[where]) for where in sorted(files))
+    return str(absolute(root)), (file for file in found if file.unread or _ends(file.where, endings))
+
+
+def _fitting(folder: Path, parts: Sequence[str], above: frozenset[tuple[int, int]]) -> Iterator[_File]:
+    """Files below a folder that fit the parts of a pattern, never through a link to a parent folder."""
+    part, *rest = parts
+    if part == "..":
+        yield from _fitting(folder / part, rest or ["*"], above)
+        return
+    inode, folders, files, unread = _listed(folder)
+    yield from unread if part != "**" or inode not in above else ()
+    folders, files = ([name for name in names if part[0] == "." or name[0] != "."] for names in (folders, files))
+    if part != "**":
+        for name in fnmatch.filter(folders if rest else files, part):
+            yield from _fitting(folder / name, rest, above) if rest else [_File(str(folder / name))]
+    elif inode not in above:
+        yield from _fitting(folder, rest or ["*"], above)
+        for name in folders:
+            yield from _fitting(folder / name, parts, above | {inode})
 
 
 def _walk(folder: Path, endings: tuple[str, ...], above: frozenset[tuple[int, int]]) -> Iterator[_File]:
     """Logs below a folder, through links too, but never through a link to a parent folder."""
+    inode, folders, files, unread = _listed(folder)
+    if inode in above:
+        return
+    yield from unread
+    for name in folders:
+        yield from _walk(folder / name, endings, above | {inode})
+    yield from (_File(str(folder / name)) for name in files if _ends(name, endings))
+
+
+def _listed(folder: Path) -> tuple[tuple[int, int], list[str], list[str], list[_File]]:
+    """Inode of a folder, the folders and files in it, and what of it cannot be read."""
+    folders, files, unread = list[str](), list[str](), list[_File]()
     try:
         status = folder.stat()
-        inode = (status.st_dev, status.st_ino)
-        entries = [] if inode in above else sorted(os.scandir(folder), key=lambda entry: entry.name)
+        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
     except OSError as error:
-        yield _File(str(folder), unread=reason(error))
-        return
+        return (0, 0), [], [], [_File(str(folder), unread=reason(error))]
     for entry in entries:
         try:
-            is_folder = entry.is_dir()
+            (folders if entry.is_dir() else files).append(entry.name)
         except OSError as error:  # a link to itself, or into a folder that cannot be read
-            yield _File(str(folder / entry.name), unread=reason(error))
-            continue
-        if is_folder:
-            yield from _walk(folder / entry.name, endings, above | {inode})
-        elif _ends(entry.name, endings):
-            yield _File(str(folder / entry.name))
+            unread.append(_File(str(folder / entry.name), unread=reason(error)))
+    return (status.st_dev, status.st_ino), folders, files, unread
 
 
 def _ends(name: str, endings: tuple[str, ...]) -> bool:

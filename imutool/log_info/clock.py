@@ -6,7 +6,8 @@ then errs by less than 0.02 %, and means by nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -21,9 +22,13 @@ from imutool.recording.sample_order import ticked
 UNUSUAL = 0.5  # share by which a period may differ from the median, to count for the rate
 MOST_BATCHED = 0.2  # share of short steps up to which stamps surely come one by one
 MOST_EXACT = 1 << 18  # steps: 2 MB, 22 minutes at 200 Hz
+MOST_HELD = 1 << 22  # steps of topics that are read in one pass: 32 MB
+LEAST_HELD = 128  # steps, whose memory a topic takes that has none
 OCTAVE_BITS = 12
 FIRST, BINS = (1023 + 10) << OCTAVE_BITS, 30 << OCTAVE_BITS  # from 1 us to 18 minutes; beyond, all are in one bin
 EDGES = (FIRST + np.arange(BINS) << (52 - OCTAVE_BITS)).view(np.float64)
+
+StampsOf = Callable[[Collection[str]], Iterable[tuple[str, Int64[np.ndarray, "..."]]]]  # of some topics, in file order
 
 
 class Steps:
@@ -182,12 +187,31 @@ class SensorStamps(IncreasingStamps):
         return self._spans.median() / SPAN
 
 
-def stamps_in_order(each: Callable[[], Iterable[Int64[np.ndarray, "..."]]]) -> IncreasingStamps:
-    """Stamps of a topic; those that repeat or go back come into memory, and are sorted."""
-    seen = IncreasingStamps()
-    for part in in_blocks(each()):
-        seen.see(part)
-    return seen if seen.increasing else sorted_stamps(np.concatenate([np.zeros(0, np.int64), *each()]))
+def clocks(stamps_of: StampsOf, counts: Mapping[str, int]) -> Iterator[tuple[int, Clock]]:
+    """Messages and clock of each topic, in as few passes over the log as memory allows.
+
+    `counts` are the messages that are expected. Stamps that repeat or go back come into memory, and are sorted.
+    """
+    group, size = list[str](), 0
+    for topic, count in counts.items():
+        group.append(topic)
+        size += min(count, MOST_EXACT) + LEAST_HELD
+        if size > MOST_HELD:
+            yield from _clocks(stamps_of, group)
+            group, size = [], 0
+    yield from _clocks(stamps_of, group)
+
+
+def _clocks(stamps_of: StampsOf, topics: list[str]) -> Iterator[tuple[int, Clock]]:
+    seen = {topic: IncreasingStamps() for topic in topics}
+    for topic, part in in_blocks(stamps_of(topics)):
+        seen[topic].see(part)
+    others = {topic: list[Int64[np.ndarray, "..."]]() for topic, stamps in seen.items() if not stamps.increasing}
+    for topic, part in stamps_of(others) if others else ():
+        others[topic].append(part)
+    for topic, stamps in seen.items():
+        in_order = sorted_stamps(np.concatenate(others.pop(topic))) if topic in others else stamps
+        yield in_order.count, in_order.clock()
 
 
 def sorted_stamps(stamp_ns: Int64[np.ndarray, " n"]) -> IncreasingStamps:
@@ -200,13 +224,13 @@ def sorted_stamps(stamp_ns: Int64[np.ndarray, " n"]) -> IncreasingStamps:
     return seen
 
 
-def in_blocks(parts: Iterable[Int64[np.ndarray, "..."]]) -> Iterator[Int64[np.ndarray, "..."]]:
-    """Stamps in blocks of at least `BLOCK`: a chunk may have one."""
-    waiting, count = list[Int64[np.ndarray, "..."]](), 0
-    for part in parts:
-        waiting.append(part)
-        count += len(part)
-        if count >= BLOCK:
-            yield np.concatenate(waiting)
-            waiting, count = [], 0
-    yield from [np.concatenate(waiting)] if waiting else []
+def in_blocks(parts: Iterable[tuple[str, Int64[np.ndarray, "..."]]]) -> Iterator[tuple[str, Int64[np.ndarray, "..."]]]:
+    """Stamps of each topic in blocks of at least `BLOCK`: a chunk may have one."""
+    waiting, count = dict[str, list[Int64[np.ndarray, "..."]]](), Counter[str]()
+    for topic, part in parts:
+        waiting.setdefault(topic, []).append(part)
+        count[topic] += len(part)
+        if count[topic] >= BLOCK:
+            yield topic, np.concatenate(waiting.pop(topic))
+            count[topic] = 0
+    yield from ((topic, np.concatenate(rest)) for topic, rest in waiting.items())

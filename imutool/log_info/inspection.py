@@ -7,7 +7,6 @@ stamps that go back, repeated stamps, and values that are not finite.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from functools import partial
 from typing import NamedTuple
 
 import msgspec
@@ -20,13 +19,13 @@ from imutool.cleaning.samples import frame_words
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.file_location import Location, log_name
 from imutool.inertial.stationary import Batch, Blocks, block_statistics, resting_blocks
-from imutool.log_info.clock import in_blocks, stamps_in_order
+from imutool.log_info.clock import clocks, in_blocks
 from imutool.log_info.convention_report import QUATERNIONS, convention_warnings, conventions, lean_warnings, truth_warnings
 from imutool.log_info.imu_motion import ImuMotion
 from imutool.log_info.imu_samples import ImuSamples
 from imutool.log_info.pose_coverage import coverage, transforms
 from imutool.log_info.pose_imu_rotation import Agreement, sparse_warnings
-from imutool.log_info.report import ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
+from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.joined_imu import JOIN_VECTORS
 from imutool.mcap_io.codec.reflection import LOG_TIME, Reflected
@@ -70,7 +69,8 @@ def describe(log: RecoveredLog, *, check: bool) -> LogInfo:
     """
     if check:
         log.check()
-    topics = [_topic(log, topic) for topic in log.topics.values()]
+    counts = {topic.name: topic.count for topic in log.topics.values()}
+    topics = [_topic(*found) for found in zip(log.topics.values(), clocks(log.stamps_of, counts), strict=True)]
     refused: list[str] = []
     true_poses = read_truth(log, lambda topic, error: refused.append(f"{topic}: {error.what}"))
     every = log.with_schema((schemas.IMU,))
@@ -115,10 +115,9 @@ def _made_by_convert(log: Log, *, has_imu: bool, has_poses: bool) -> list[str]:
     return [f"imutool convert LOG OUT makes {what} of {name}" for name, what in made.items() if lacking.get(what)]
 
 
-def _topic(log: Log, topic: Topic) -> TopicInfo:
-    stamps = stamps_in_order(partial(log.stamps, topic.name))
-    schema = topic.own_schema or topic.schema_name
-    return TopicInfo(topic.name, schema, topic.message_encoding, stamps.count, *stamps.clock())
+def _topic(topic: Topic, found: tuple[int, Clock]) -> TopicInfo:
+    count, clock = found
+    return TopicInfo(topic.name, topic.own_schema or topic.schema_name, topic.message_encoding, count, *clock)
 
 
 def _coverages(log: Log, imu: Topic | None) -> Iterator[TruthInfo]:
@@ -126,7 +125,9 @@ def _coverages(log: Log, imu: Topic | None) -> Iterator[TruthInfo]:
     for topic in map(log.topics.__getitem__, log.pose_topics):
         own = [(topic.name, np.concatenate([np.empty(0, np.int64), *log.stamps(topic.name)]))]
         for name, stamp_ns in transforms(log, topic.name) if topic.schema_name == schemas.TF else own:
-            yield coverage(name, topic.pose_kind, stamp_ns, in_blocks(log.stamps(imu.name)) if imu else ())
+            yield coverage(
+                name, topic.pose_kind, stamp_ns, (part for _, part in in_blocks(log.stamps_of([imu.name]))) if imu else ()
+            )
 
 
 def _poses(log: Log, topic: str, known: Truth | None) -> Truth | None:

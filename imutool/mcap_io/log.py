@@ -11,12 +11,12 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
-from imutool.array_types import Int64
+from imutool.array_types import Int64, UInt64
 from imutool.errors import DataError, LogError
 from imutool.file_location import Location, location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records, schemas
-from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch
+from imutool.mcap_io.codec.decode import PoseBatch
 from imutool.mcap_io.codec.joined_imu import choice_of, no_imu_fix, parse_parts, whole_of
 from imutool.mcap_io.codec.records import HEAD, keep_buffers
 from imutool.mcap_io.index import LogIndex
@@ -26,7 +26,6 @@ from imutool.mcap_io.topics import (
     ENCODINGS,
     MESSAGE_POSES,
     PART_KEY,
-    StampCheck,
     Topic,
     joined_topic,
     reflected_topics,
@@ -56,7 +55,6 @@ class Log:
         self._source = path if isinstance(path, Source) else Source(location(path))
         self._owns_source, self.path = True, self._source.path
         self.kept: KeptChunks | None = None
-        self._begun: tuple[MessageBlock, messages.Messages | None] | None = None
         self._ids = (0, 0), dict[str, set[int]]()  # channels by topic, of an index and so many channels
         try:
             with self.named():
@@ -70,9 +68,9 @@ class Log:
         return LogIndex(source, self.max_chunk)
 
     def _read_topics(self) -> None:
-        """Reads the topics from the index; IMUs of other types may need the first message of a topic."""
+        """Reads the topics from the index; IMUs of other types may need the first messages."""
         self.topics = MappingProxyType(topics_of(self.index))
-        self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, self.first)})
+        self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, self.firsts)})
 
     def __enter__(self) -> Log:
         return self
@@ -199,57 +197,58 @@ class Log:
         return found
 
     def stamps(self, topic: str) -> Iterator[Int64[np.ndarray, " n"]]:
-        """Log times of one topic in file order, from message indexes where possible.
+        """Log times of one topic in file order; LogError as `stamps_of`."""
+        return (times for _, times in self.stamps_of([topic]))
 
-        Raises:
-            LogError: no such topic, or a damaged log.
-        """
-        if topic not in self.topics:
-            raise LogError(f"there is no topic {topic}", where=self.path, expected=self.listing())
-        channels = self.channel_ids(topic)
-        with self.named(topic):
+    def stamps_of(self, topics: Collection[str]) -> Iterator[tuple[str, Int64[np.ndarray, " n"]]]:
+        """Log times of some topics in file order, from message indexes where possible; LogError as `topic`, or for damage."""
+        wanted: dict[int, list[str]] = {}  # topics by channel: a joined IMU has that of its gyroscope
+        for topic in topics:
+            if topic not in self.topics:
+                raise LogError(f"there is no topic {topic}", where=self.path, expected=self.listing())
+            for channel in self.channel_ids(topic):
+                wanted.setdefault(channel, []).append(topic)
+        channels = set(wanted)
+        with self.named(*topics if len(topics) == 1 else ()):
             for block in (block for block in self.index.blocks if block.may_hold(channels)):
-                indexed = sorted(channels & block.indexes.keys()) if block.trusted and not block.edited else []
-                entries = [self.index.entries(block, c) for c in indexed]
-                if len(entries) == 1 and len(entries[0]) == 1:
-                    yield messages.signed(entries[0][:, 0])
-                elif indexed and all(len(entry) for entry in entries):
-                    table = np.concatenate(entries)
-                    yield messages.signed(table[np.argsort(table[:, 1], kind="stable"), 0])
-                elif (found := self.index.unpack_or_lose(block)) is not None:
-                    times = found.times()[found.of_channels(channels)]
-                    yield from [times] if len(times) else []
+                tables: dict[str, list[UInt64[np.ndarray, "n 2"]]] = {}
+                for channel, entries in self._entries(block, channels).items():
+                    for topic in wanted[channel]:
+                        tables.setdefault(topic, []).append(entries)
+                for topic, parts in tables.items():
+                    table = np.concatenate(parts)
+                    yield topic, messages.signed(table[np.argsort(table[:, 1], kind="stable"), 0])
 
-    def imu_batches(self, topic: str) -> Iterator[ImuBatch]:
-        """The messages of an IMU topic in file order, a chunk at a time.
-
-        Raises:
-            LogError: no such IMU topic, another encoding, NaN or infinite values, stamps that do not increase, damage.
-        """
-        described, stamps = self.topic(topic, (schemas.IMU,)), StampCheck()
-        for _, rows in self.rows([described.name]):
-            with self.named(described.name):
-                for batch in described.decode_imu(rows):
-                    stamps.check_imu(batch)
-                    yield batch
+    def _entries(self, block: MessageBlock, channels: set[int]) -> dict[int, UInt64[np.ndarray, "n 2"]]:
+        """Log times and offsets of a block's messages, by channel."""
+        if block.trusted and not block.edited:
+            listed = {channel: self.index.entries(block, channel) for channel in channels & block.indexes.keys()}
+            if listed and all(map(len, listed.values())):
+                return listed
+        found = self.index.unpack_or_lose(block)
+        return {} if found is None else found.entries(channels)
 
     def pose_batches(self, topic: str, end_ns: int | None = None) -> Iterator[PoseBatch]:
-        """The poses of a topic in file order; of a TFMessage one batch per transform in it; LogError as `imu_batches`."""
+        """The poses of a topic in file order; of a TFMessage one batch per transform in it; LogError as `topic`."""
         described = self.topic(topic, (*MESSAGE_POSES, schemas.TF))
         for _, rows in self.rows([topic], end_ns=end_ns):
             with self.named(topic):
                 yield from described.decode_poses(rows)
 
-    def first(self, topic: str) -> bytes | None:
-        """First message of a topic; its chunk stays unpacked until `rows`, as many topics begin in one."""
-        channels = self.channel_ids(topic)
-        with self.named(topic):
-            for block in (block for block in self.index.blocks if block.may_hold(channels)):
-                if self._begun is None or self._begun[0] is not block:
-                    self._begun = block, self.index.unpack_or_lose(block)
-                for _, rows in self._cut(self._begun[1], {topic: channels}) if self._begun[1] else ():
-                    return bytes(rows.payload[0])
-        return None
+    def firsts(self, topics: Collection[str]) -> dict[str, bytes]:
+        """First messages of some topics, in a pass that ends with the last of them."""
+        wanted, found = {channel: topic for topic in topics for channel in self.channel_ids(topic)}, dict[str, bytes]()
+        channels = set(wanted)
+        with self.named():
+            for block in (block for block in self.index.blocks if channels and block.may_hold(channels)):
+                if (read := self.index.unpack_or_lose(block)) is None:
+                    continue
+                for channel, table in sorted(read.entries(channels).items(), key=lambda entries: int(entries[1][0, 1])):
+                    at = int(table[0, 1])
+                    end = at + HEAD.size + HEAD.unpack_from(read.data.data, at)[1]
+                    found.setdefault(wanted[channel], read.data[at + messages.MESSAGE.itemsize : end].tobytes())
+                channels = {channel for channel in channels if wanted[channel] not in found}
+        return found
 
     def channel_ids(self, topic: str) -> set[int]:
         """Channels of a topic; for a joined IMU those of its gyroscope."""
@@ -269,12 +268,12 @@ class Log:
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[tuple[str, messages.Rows]]:
         """The messages of some topics in file order; each chunk is unpacked once for all topics."""
-        self._begun = None  # one chunk in memory
         wanted = {topic: self.channel_ids(topic) for topic in topics}
         every = set().union(*wanted.values()) if wanted else set()
         first, last = -1 if start_ns is None else start_ns, 2**63 - 1 if end_ns is None else end_ns
         with self.named():
-            blocks = (b for b in self.index.blocks if b.may_hold(every) and b.start_ns <= last and (b.end_ns or last) >= first)
+            inside = (b for b in self.index.blocks if (end_ns is None or b.start_ns <= last) and (b.end_ns or last) >= first)
+            blocks = (block for block in inside if block.may_hold(every))
             for near in neighbours(blocks) if self.kept is None else ([block] for block in blocks):
                 yield from self._rows_of(near, wanted, first, last)
 

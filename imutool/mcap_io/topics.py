@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
@@ -200,16 +200,6 @@ class StampCheck:
             )
         self.count, self.last = self.count + len(stamp_ns), int(stamp_ns[-1])
 
-    def check_imu(self, batch: ImuBatch) -> None:
-        """Takes in the next samples of an IMU.
-
-        Raises:
-            LogError: NaN, infinity, or a stamp that does not come after the one before it.
-        """
-        check_finite(batch, CLEAN_FIX, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
-        self.fix = CLEAN_FIX
-        self.check(batch.stamp_ns, batch.sequence)
-
 
 def topics_of(index: LogIndex) -> dict[str, Topic]:
     """The topics of a log by their names, in order of their channel ids.
@@ -235,43 +225,54 @@ def topics_of(index: LogIndex) -> dict[str, Topic]:
     return found
 
 
-def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callable[[str], bytes | None]) -> dict[str, Topic]:
+def reflected_topics(
+    index: LogIndex, topics: Mapping[str, Topic], firsts: Callable[[Collection[str]], Mapping[str, bytes]]
+) -> dict[str, Topic]:
     """IMUs and poses among the topics whose type is not that of ROS.
 
-    `first` gives the first message of a topic.
-    Types of ROS 2 count only where the log has no other recorded IMU: drivers publish their own message beside that of ROS.
+    `firsts` gives the first messages of some. Types of ROS 2 count only if no other IMU was recorded: drivers publish both.
     """
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
     found: dict[str, Topic] = {}
-    for name, topic in topics.items():
-        if topic.message_encoding not in REFLECTED or RECORDED_KEY in topic.metadata:
-            continue
+    reflected = {n: t for n, t in topics.items() if t.message_encoding in REFLECTED and RECORDED_KEY not in t.metadata}
+    first = firsts([name for name, topic in reflected.items() if topic.message_encoding == "json"])
+    for name, topic in reflected.items():
         schema = definition.data if (definition := definitions[name]) else b""
         try:
             several = TYPE.fullmatch(topic.schema_name)
             if several and (form := format_of(topic.message_encoding, topic.schema_name, schema)):
                 found[name] = _as_ros(topic, Transforms(form, bool(several[1])))
                 continue
-            raw = first(name) if topic.message_encoding == "json" else None
-            message = reflect(topic.message_encoding, name, topic.schema_name, schema, raw)
+            message = reflect(topic.message_encoding, name, topic.schema_name, schema, first.get(name))
         except ImportError:
             continue
         if message is not None:
             found[name] = _as_ros(topic, message)
     imus = {name: topic for name, topic in {**topics, **found}.items() if topic.schema_name == schemas.IMU}
-    own = {name: definition for name, topic in imus.items() if (definition := definitions[name]) and not topic.reflected}
-    odd = {name for name, definition in own.items() if not ros2_definition.is_imu_of_ros(definition.data)}
+    texts: dict[str, set[bytes]] = {name: set() for name in topics}  # of all channels of a topic
+    for channel in index.channels.values():
+        texts[channel.topic] |= {index.schemas[channel.schema_id].data} if channel.schema_id in index.schemas else set()
+    odd = {n for n, t in imus.items() if not t.reflected and not all(map(ros2_definition.is_imu_of_ros, texts[n]))}
     known = any(not topic.is_derived for name, topic in imus.items() if name not in odd)
     for name, topic in topics.items():
         described = (topic.schema_encoding, topic.message_encoding, topic.is_derived) == ("ros2msg", "cdr", False)
         definition = definitions[name] if described and (name in odd or not known) else None
-        if definition is not None and (imu := reflect_cdr(topic.schema_name, definition.data)) is not None:
-            texts = {index.schemas[c.schema_id].data for c in index.channels.values() if c.topic == name and c.schema_id}
-            ros2_definition.refuse_two(name, topic.schema_name, [ros2_definition.parse(topic.schema_name, t) for t in texts])
+        imu = None if definition is None else reflect_cdr(topic.schema_name, definition.data)
+        if imu is not None and _have_one_layout(topic, texts[name]):
             found[name] = _as_ros(topic, imu)
-        elif name in odd:  # whose bytes would be read in the order of ROS
-            found[name] = replace(topic, schema_name=f"{topic.schema_name} (another definition)")
+        elif imu is not None or name in odd:  # whose bytes would be read in the order of another
+            which = "two definitions" if len(texts[name]) > 1 else "another definition"
+            found[name] = replace(topic, schema_name=f"{topic.schema_name} ({which})")
     return found
+
+
+def _have_one_layout(topic: Topic, texts: Collection[bytes]) -> bool:
+    try:
+        each = [ros2_definition.parse(topic.schema_name, text) for text in texts]
+        ros2_definition.refuse_two(topic.name, topic.schema_name, each)
+    except LogError:
+        return False
+    return True
 
 
 def _as_ros(topic: Topic, message: Reflected | Transforms) -> Topic:

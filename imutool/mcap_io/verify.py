@@ -15,7 +15,7 @@ from mcap.records import AttachmentIndex, DataEnd, MetadataIndex, SummaryOffset
 
 from imutool.errors import ConfigError, LogError
 from imutool.file_location import Location
-from imutool.mcap_io.blocks import Attachment, MessageBlock, RecordSpan, read_message_indexes
+from imutool.mcap_io.blocks import Attachment, MessageBlock, RecordSpan, read_message_indexes, too_large
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.records import CHUNK_HEAD, FOOTER_SIZE, HEAD, MAGIC
 from imutool.mcap_io.index import LogIndex
@@ -116,6 +116,8 @@ class _Sums:
         """Checks a block, with `whole` its messages too."""
         if block.compression is None:
             raise LogError(f"messages lie outside chunks at byte {block.offset}", expected="chunks alone")
+        if whole and block.length > index.max_chunk:
+            raise too_large("chunk", block.offset, block.length, index.max_chunk)
         if whole:
             everything = memoryview(index.source.at(block.offset, block.end - block.offset))
             head, listed, right, _ = check_chunk(everything, block, index.max_chunk)

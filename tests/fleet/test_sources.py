@@ -103,7 +103,10 @@ def test_logs_that_all_lie_in_out_are_told_as_such(tmp_path: Path, out: str) -> 
         find(str(tmp_path / "logs"), tmp_path / out)
 
 
-def test_a_folder_that_cannot_be_read_is_told_and_the_others_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("pattern", ["", "**/*.mcap"])
+def test_a_folder_that_cannot_be_read_is_told_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pattern: str
+) -> None:
     tree(tmp_path, "good.mcap", "lost+found/a.mcap")
     (tmp_path / "circle.mcap").symlink_to("circle.mcap")
     listed = os.scandir
@@ -114,7 +117,7 @@ def test_a_folder_that_cannot_be_read_is_told_and_the_others_go_on(tmp_path: Pat
         return listed(folder)
 
     monkeypatch.setattr(os, "scandir", scandir)
-    found = find(str(tmp_path), NOWHERE)
+    found = find(str(tmp_path / pattern), NOWHERE)
     assert [log.name for log in found.logs] == ["good.mcap"]
     assert [Path(where).name for where, _ in found.refused] == ["circle.mcap", "lost+found"]
     assert "cannot be read (Permission denied)" in found.refused[1][1]
@@ -153,7 +156,9 @@ def test_links_to_logs_are_followed_but_not_in_circles(tmp_path: Path) -> None:
     fleet = tree(tmp_path / "fleet", "own.mcap")
     (fleet / "robot").symlink_to(tmp_path / "disk")
     (tmp_path / "disk" / "x" / "back").symlink_to(tmp_path / "disk")
-    assert names(fleet) == ["own.mcap", "robot/x/log.mcap"]
+    (tmp_path / "disk" / "x" / "again").symlink_to(tmp_path / "disk")  # two circles: a pattern took 2^40 ways
+    for each in (fleet, fleet / "**", fleet / "**" / "*.mcap"):
+        assert names(each) == ["own.mcap", "robot/x/log.mcap"]
 
 
 @pytest.mark.parametrize("empty", ["", "*.mcap", "none", "none/*.mcap"])

@@ -7,7 +7,7 @@ import pytest
 
 from imutool.cleaning.stamp_line import usual_period
 from imutool.log_info import clock
-from imutool.log_info.clock import SensorStamps, stamps_in_order
+from imutool.log_info.clock import SensorStamps, clocks
 
 START_NS, PERIOD_NS, COUNT = 1_700_000_000_000_000_000, 5_000_000, 20_000
 COARSE = 2e-4  # of a median from the histogram
@@ -61,14 +61,15 @@ def test_stamps_that_go_back_or_repeat_are_sorted() -> None:
     mixed = t_ns.copy()
     mixed[[5, 6]] = mixed[[6, 5]]
     assert not seen(mixed).sound
-    assert stamps_in_order(lambda: np.array_split(mixed, 300)).clock() == seen(t_ns).clock()
-    twice = stamps_in_order(lambda: [t_ns, t_ns[-1:]])
-    assert (twice.count, twice.clock().largest_gap_s) == (len(t_ns) + 1, seen(t_ns).clock().largest_gap_s)
+    parts = [("/a", part) for part in np.array_split(mixed, 300)] + [("/b", t_ns), ("/b", t_ns[-1:])]
+    (_, a), (count, b) = clocks(lambda topics: [part for part in parts if part[0] in topics], {"/a": COUNT, "/b": COUNT})
+    assert a == seen(t_ns).clock()
+    assert (count, b.largest_gap_s) == (len(t_ns) + 1, a.largest_gap_s)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_stamps_have_no_clock_or_one_step(count: int) -> None:
-    read = stamps_in_order(lambda: [START_NS + PERIOD_NS * np.arange(count)]).clock()
+    ((_, read),) = clocks(lambda _: [("/a", START_NS + PERIOD_NS * np.arange(count))], {"/a": count})
     assert read.rate_hz == (200.0 if count == 2 else None)
     assert read.first_ns == (START_NS if count else None)
 

@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.diagnosis.signals.signal_diagnosis import diagnose_signal
 from imutool.errors import LogError
-from imutool.mcap_io.codec import ros2_definition
+from imutool.mcap_io.codec import ros2_definition, schemas
 from imutool.mcap_io.fields import numeric_fields, others, read_field
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.repair import repair
@@ -267,18 +267,23 @@ def test_two_definitions_of_a_topics_messages_are_never_mistaken_for_one(tmp_pat
         read_field(tmp_path / "merged.mcap", "/a.a")
 
 
-def test_two_layouts_of_an_imu_s_messages_are_never_mistaken_for_one(tmp_path: Path) -> None:
-    """The gyro of the first log was read as the accelerometer."""
+@pytest.mark.parametrize("name", ["a/msg/RawImu", schemas.IMU])
+def test_two_layouts_of_an_imu_s_messages_are_never_mistaken_for_one(tmp_path: Path, name: str) -> None:
+    """The gyro of the first log was read as the accelerometer, and then no command read the rest of the log."""
+    texts = [b"float64[3] gyro\nfloat64[3] accel\n", b"float64[3] accel\nfloat64[3] gyro\n"]
+    if name == schemas.IMU:
+        whole = schemas.definition(schemas.IMU)
+        swapped = whole.replace(" angular_velocity", " @").replace(" linear_acceleration", " angular_velocity")
+        texts = [swapped.replace(" @", " linear_acceleration").encode(), whole.encode()]
     with (tmp_path / "merged.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
-        for n, order in enumerate(("gyro accel", "accel gyro")):
-            definition = "".join(f"float64[3] {sensor}\n" for sensor in order.split()).encode()
-            channel = writer.register_channel("/imu", "cdr", writer.register_schema("a/msg/RawImu", "ros2msg", definition))
+        for n, definition in enumerate(texts):
+            channel = writer.register_channel("/imu", "cdr", writer.register_schema(name, "ros2msg", definition))
             writer.add_message(channel, START_NS + n, struct.pack("<I6d", 0x100, *range(6)), START_NS + n)
         writer.finish()
-    with pytest.raises(LogError, match="two definitions of a/msg/RawImu are on /imu"):
-        Log(tmp_path / "merged.mcap")
+    with Log(tmp_path / "merged.mcap") as log, pytest.raises(LogError, match=r"carries .* \(two definitions\)"):
+        log.topic("/imu", (schemas.IMU,))
     assert repair(tmp_path / "merged.mcap", tmp_path / "saved.mcap").messages == {"/imu": 2}
 
 

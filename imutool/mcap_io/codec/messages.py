@@ -58,6 +58,13 @@ class Messages(NamedTuple):
             mask |= of == channel
         return mask
 
+    def entries(self, channels: Collection[int]) -> dict[int, UInt64[np.ndarray, "n 2"]]:
+        """Log times and offsets of the messages of some channels, by channel, as message indexes list them."""
+        order = np.argsort(self.heads["channel"], kind="stable")
+        ids, first = np.unique(self.heads["channel"][order], return_index=True)
+        table = np.stack([self.heads["log_time"], self.offsets.view(np.uint64)], axis=1)[order]
+        return {c: part for c, part in zip(ids.tolist(), np.split(table, first[1:]), strict=False) if c in channels}
+
 
 class Rows(NamedTuple):
     """Consecutive messages of equal size, as columns.
@@ -155,9 +162,8 @@ def parse(data: bytes | memoryview, offset: int) -> Messages:
         LogError: the records do not fill the bytes exactly; `offset` says where in the file they came from.
     """
     if len(data) >= MESSAGE.itemsize and HEAD.unpack_from(data) == (Opcode.MESSAGE, len(data) - HEAD.size):
-        return Messages(
-            np.frombuffer(data, np.uint8), AT_ZERO, np.frombuffer(data, MESSAGE, 1), []
-        )  # in a hundredth of the time
+        # in a hundredth of the time
+        return Messages(np.frombuffer(data, np.uint8), AT_ZERO, np.frombuffer(data, MESSAGE, 1), [])
     try:
         offsets, definitions, end = scan(data)
     except LogError as error:

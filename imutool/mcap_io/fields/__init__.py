@@ -176,7 +176,11 @@ def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
     Raises:
         LogError: no schema, or another encoding.
     """
-    decoder, message = decoder_of(log, log.topics[topic]), log.first(topic)
+    return _numeric(log, topic, log.firsts([topic]).get(topic), long=long)
+
+
+def _numeric(log: Log, topic: str, message: bytes | None, *, long: bool) -> list[str]:
+    decoder = decoder_of(log, log.topics[topic])
     with log.named(topic):
         return [] if message is None else decoder.paths(message, long)
 
@@ -194,8 +198,10 @@ def others(
     """
     with PlainLog(path) as log:
         readers, left = dict[str, Reader](), READ_FACTOR * most
-        for name, topic in log.topics.items():
-            paths = [] if name in skip or topic.is_derived else _offered(log, name)
+        asked = {name: topic for name, topic in log.topics.items() if name not in skip and not topic.is_derived}
+        first = log.firsts(asked)
+        for name, topic in asked.items():
+            paths = _offered(log, name, first.pop(name, None))
             paths = [inside for inside in paths if f"{name}.{inside}" != signal and not _NO_CHANNEL.search(inside)][:left]
             if paths:
                 readers[name], left = Reader(log, topic, tuple(paths), strict=False), left - len(paths)
@@ -206,10 +212,10 @@ def others(
     return dict(islice(((name, values) for name, values in offered if values is not None), most))
 
 
-def _offered(log: Log, topic: str) -> list[str]:
+def _offered(log: Log, topic: str, message: bytes | None) -> list[str]:
     """Numeric fields of a topic, none where it has no readable definition."""
     try:
-        return numeric_fields(log, topic, long=False)
+        return _numeric(log, topic, message, long=False)
     except LogError:
         return []
 

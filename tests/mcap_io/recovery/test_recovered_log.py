@@ -23,6 +23,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Metadata
 from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 from support import log_damage
 
@@ -539,6 +540,20 @@ def test_nothing_longer_than_a_chunk_may_be_comes_into_memory(tmp_path: Path, mo
     path.write_bytes(MAGIC + HEAD.pack(1, 8) + bytes(8) + bytes(size) + footer)
     with in_time(), in_room(), RecoveredLog(path) as log:
         assert log.losses
+
+
+def test_a_sound_chunk_above_the_bound_does_not_come_into_memory_for_repair(tmp_path: Path) -> None:
+    """A chunk of 1 GB took 1 GB before it was left out."""
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE, chunk_size=1000)
+        writer.start()
+        channel = writer.register_channel("/a", "raw", 0)
+        for size in (900, 900, 50 << 20, 900, 900):
+            writer.add_message(channel, 1, bytes(size), 1)
+        writer.finish()
+    with in_room():
+        report = repair(tmp_path / "log.mcap", tmp_path / "saved.mcap", max_chunk=1 << 20)
+    assert (sum(report.messages.values()), len(report.losses.entries)) == (4, 1)
 
 
 def test_a_definition_that_contains_itself_is_refused() -> None:
