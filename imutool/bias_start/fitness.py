@@ -270,8 +270,10 @@ def _other_conditions(model: BiasModel, samples: Samples) -> list[str]:
     ratio = float((noise[known] / model.noise_std[known]).max()) if known.any() else 0.0
     if ratio > MOST_NOISE:  # less noise is no doubt: a drone in the hand has a tenth of that in flight
         sentences.append(f"the samples are {ratio:.0f} times as noisy as in the training runs: another sensor, or vibration")
-    rate_hz = 1.0 / float(quantile(np.diff(samples[0]), 0.5))
-    if model.rate_hz and abs(rate_hz / model.rate_hz - 1.0) > MOST_RATE:
+    steps = np.diff(samples[0])
+    shorter, period_s, longer = (float(quantile(steps, share)) for share in (0.25, 0.5, 0.75))
+    rate_hz, scatter = 1.0 / period_s, (longer - shorter) / period_s / math.sqrt(len(steps))  # of the median of uneven steps
+    if model.rate_hz and abs(rate_hz / model.rate_hz - 1.0) > MOST_RATE + SURE * scatter:
         sentences.append(f"samples at {rate_hz:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
     return sentences
 

@@ -222,6 +222,15 @@ def test_more_noise_is_doubtful_and_less_is_not(model: BiasModel, recording: Rec
     assert "5 times as noisy" in found.reasons[0]
 
 
+@pytest.mark.parametrize("jitter", [0.0, 0.4])
+def test_another_rate_is_a_doubt_where_the_steps_show_it(jitter: float, model: BiasModel, recording: Recording) -> None:
+    """The median step of stamps that jitter scatters by itself."""
+    imu, period_ns = recording.imu, 1e9 * recording.imu.period_s
+    late_ns = np.random.default_rng(6).uniform(-jitter, jitter, len(imu)) * period_ns
+    found = judged(model, Imu(imu.t_ns + (0.005 * period_ns * np.arange(len(imu)) + late_ns).astype(np.int64), imu.gyro, imu.accel))
+    assert ("Hz, in the training runs at" in " ".join(found.reasons)) == (jitter == 0.0), found
+
+
 def test_an_unfit_model_is_refused_unless_forced_and_a_doubtful_one_is_used(
     model: BiasModel, recording: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
