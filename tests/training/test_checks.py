@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from imutool.errors import DataError
+from imutool.log_info.convention_report import check_conventions
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor.made_up_flight import flight
@@ -107,6 +108,13 @@ def test_poses_that_are_means_over_some_time_are_named(over_s: float, caplog: py
     smoothed = Poses(poses.t_ns[kept], poses.p_wb[kept], q[kept])
     warn_of_smoothed_poses(Pool.of([replace(flown, truths={"/ground_truth/pose": smoothed})]))
     assert ("smoothed over about 0.39 s" in caplog.text) == (over_s > 0.0), caplog.text
+
+
+def test_stamps_in_batches_are_refused_before_the_poses_clock_that_they_seem_to_shift(flown: Recording) -> None:
+    imu, row = flown.imu, np.arange(len(flown.imu))
+    stamps = imu.t_ns[np.minimum(row // 5 * 5 + 4, len(imu) - 1)] + 100_000 * (row % 5)
+    with pytest.raises(DataError, match=r"batches of about 5.0 samples.*--restamp corrects it"):
+        check_conventions([replace(flown, imu=Imu(stamps, imu.gyro, imu.accel))])
 
 
 def test_a_few_seconds_are_not_enough() -> None:
