@@ -109,8 +109,8 @@ def turn_on_prior(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[
     Within a session the variance comes from n logs, as many degrees of freedom too few to be known: the next log follows
     Student's t, whose variance is n / (n - 2) times larger, at most `MOST_TAIL`. Where most logs that follow each other closely
     differ all the same, the next log is of a session of its own, and no session is returned. A bias that no log shows is NaN:
-    zero is expected of it, with `TURN_ON_STD`. No size exceeds that of the biases by more than `MOST_TURN_ON`: a fibre-optic gyro
-    has a bias of 1e-5 rad/s, and a new turn-on no other.
+    zero is expected of it, with `TURN_ON_STD`. No size exceeds that of the biases by more than `MOST_TURN_ON`: after another
+    turn-on a fibre-optic gyro has 1e-5 rad/s again.
     """
     known, rest = np.isfinite(rest).all(axis=0), np.nan_to_num(rest)
     groups, broken = _sessions(rest, spans_ns)
