@@ -59,7 +59,7 @@ def at_rate(model: BiasModel, rate_hz: float, where: object, t_ns: Stamps | None
 
 
 def other_conditions(model: BiasModel, samples: tuple[Float64[np.ndarray, " n"], Rows3, Rows3]) -> list[str]:
-    """Sentences on noise and rate of some samples (times, gyro, accel) that the training logs did not have."""
+    """Sentences on noise and rate of some samples that the training logs did not have."""
     sentences = []
     noise = white_noise(np.concatenate([samples[1], samples[2]], axis=1))
     known = model.noise_std > 0

@@ -207,10 +207,10 @@ def stops_in(samples: Samples) -> list[tuple[float, float]]:
 
 
 def refuted_stops(samples: Samples) -> tuple[Vector6, Vector6] | None:
-    """Bias and its deviation by gravity in motion, where this refutes the first stop: a turn about gravity looks like rest.
+    """Bias and its deviation by gravity in motion, where this refutes the first stop.
 
-    The innovations after it are then likelier where all is taken for motion, and the bias about gravity is another one. Of logs
-    of EuRoC, FETCH, BROAD, RepoIMU and a car their log-likelihood is larger by 4 at most, after a turn of 0.015 rad/s by 23.
+    A turn about gravity looks like rest. The innovations after it are likelier where all is taken for motion, and the bias about
+    gravity is another one. Of logs of EuRoC, FETCH, BROAD, RepoIMU and a car their log-likelihood is larger by 4 at most.
     """
     known = replace(UNTRAINED, std=UNKNOWN_STD, settings=bias_prior(static.Model()).settings)
     both = [BiasFilter(prior, ahead=True) for prior in (known, replace(known, stops=False))]

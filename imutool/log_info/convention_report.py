@@ -30,6 +30,7 @@ from imutool.log_info.pose_imu_rotation import (
     velocities_judged,
 )
 from imutool.log_info.report import Convention, TruthInfo
+from imutool.mcap_io.topics import RESTAMP
 from imutool.recording import GRAVITY_M_S2, Imu, Recording
 
 logger = logging.getLogger(__name__)
@@ -207,9 +208,7 @@ def check_conventions(recordings: Iterable[Recording]) -> None:
     for each in map(velocities_judged, recordings):
         where = f"{each.name} {each.imu_topic}"
         if faults := read_stamps(each.imu.t_ns).faults:
-            raise DataError(
-                faults[0], where=where, expected="the sensor's own times", fix=CORRECTION.replace("--fix", "--restamp")
-            )
+            raise DataError(faults[0], where=where, expected="the sensor's own times", fix=f"{RESTAMP} corrects it")
         check_motion(motion_of(each.imu, truth_of(each)), truth_of(each), where)
 
 

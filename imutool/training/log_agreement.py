@@ -1,4 +1,4 @@
-"""Logs that contradict the others: turned axes, another unit or another mount; and poses that are smoothed."""
+"""Logs that contradict the others, by axes, unit or mount, and poses that are smoothed."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _name_other_units(names: Sequence[str], bias: Float64[np.ndarray, "logs 3"])
 
 
 def warn_of_smoothed_poses(pool: Pool) -> None:
-    """Warn of poses that are means over some time: they show fast turns too small, and a model learns that as a scale."""
+    """Warn of poses that are means over some time, whose turns teach a wrong scale."""
     for log, name in enumerate(pool.names):
         over_s, share = _smoothing(pool, log)
         if share > TOO_SMALL:
@@ -98,10 +98,11 @@ def warn_of_smoothed_poses(pool: Pool) -> None:
 
 @torch.no_grad()
 def _smoothing(pool: Pool, log: int) -> tuple[float, float]:
-    """Time over which a log's poses are means, and the share of half a second's turn that this hides; zero where unclear.
+    """Time over which a log's poses are means, and the share of half a second's turn that this hides.
 
-    Means over T miss the share T^2 / 24 of the second derivative of the attitude: the residual of a window is that share of
-    w'_end - R^T w'_start, beside scale, misalignment, bias, mount and a clock that is off by tau, whose square counts alike.
+    The share is zero where it is not clear. Means over T miss the share T^2 / 24 of the second derivative of the attitude: the
+    residual of a window is that share of w'_end - R^T w'_start, beside scale, misalignment, bias, mount and a clock that is off
+    by tau, whose square counts alike.
     """
     n, h = pool.samples(SMOOTHED_S), pool.samples(SLOPE_S)
     first = pool.starts(n, "all", hop=max(1, n // 2))
