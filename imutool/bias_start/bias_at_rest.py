@@ -209,8 +209,8 @@ def stops_in(samples: Samples) -> list[tuple[float, float]]:
 def refuted_stops(samples: Samples) -> tuple[Vector6, Vector6] | None:
     """Bias and its deviation by gravity in motion, where this refutes the first stop.
 
-    A turn about gravity looks like rest. The innovations after it are likelier where all is taken for motion, and the bias about
-    gravity is another one. Of logs of EuRoC, FETCH, BROAD, RepoIMU and a car their log-likelihood is larger by 4 at most.
+    A turn about gravity looks like rest. The innovations after it are likelier where all is taken for motion, and the bias
+    about gravity is another one. Of logs of EuRoC, FETCH, BROAD, RepoIMU and a car their log-likelihood is larger by 4 at most.
     """
     known = replace(UNTRAINED, std=UNKNOWN_STD, settings=bias_prior(static.Model()).settings)
     both = [BiasFilter(prior, ahead=True) for prior in (known, replace(known, stops=False))]
