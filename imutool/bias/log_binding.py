@@ -12,8 +12,10 @@ from imutool.array_types import Float64, Int64
 from imutool.bias.model import COLUMNS, BiasModel, Covariances, Vector6
 from imutool.bias.temperature import TemperatureFilter, celsius_of, channel_of, holding, scale_of
 from imutool.errors import ModelError
+from imutool.inertial.stationary import white_noise
 from imutool.mcap_io.temperature import EVERY_NS, is_temperature, thinned
 from imutool.recording import Imu, Scalars
+from imutool.recording.columns import quantile
 from imutool.sensor.signals import TEMPERATURE_TERMS
 
 RATE_TOLERANCE = 0.05  # a real rate differs from its nominal one by a few per mille (BMI160: 199.4 for 200)
@@ -22,6 +24,8 @@ BATCHES = "The stamps come in batches: imutool convert LOG OUT --restamp puts th
 MOST_AGE_S = 60.0  # of a number of the channel: a case warms within minutes
 SET_BACK = 2  # half seconds: further back the clock was set, and the sample is not late
 WALK_NS = 10_000_000_000  # between two numbers of a drift, from which its walk is taken
+MOST_NOISE = 4.0  # ratio to the residuals of the training logs; training logs up to 2.0
+MOST_RATE, SURE = 2e-3, 3.0  # relative difference of rates: one unit's clock stays within 1e-4; deviations of a median step
 MOST_BEYOND_K = 1.0  # beyond the trained range, before it counts as another one
 Rows3 = Float64[np.ndarray, "n 3"]
 Rows6 = Float64[np.ndarray, "n 6"]
@@ -52,6 +56,22 @@ def at_rate(model: BiasModel, rate_hz: float, where: object, t_ns: Stamps | None
     if possible:
         fix += f", or use it at this rate with `force` (an OnlineDebiaser with `model.at({rate_hz:.0f})`)"
     raise ModelError(what, where=where, expected=expected, fix=fix)
+
+
+def other_conditions(model: BiasModel, samples: tuple[Float64[np.ndarray, " n"], Rows3, Rows3]) -> list[str]:
+    """Sentences on noise and rate of some samples that the training logs did not have."""
+    sentences = []
+    noise = white_noise(np.concatenate([samples[1], samples[2]], axis=1))
+    known = model.noise_std > 0
+    ratio = float((noise[known] / model.noise_std[known]).max()) if known.any() else 0.0
+    if ratio > MOST_NOISE:  # less noise is no doubt: a drone in the hand has a tenth of that in flight
+        sentences.append(f"the samples are {ratio:.0f} times as noisy as in the training runs: another sensor, or vibration")
+    steps = np.diff(samples[0])
+    shorter, period_s, longer = (float(quantile(steps, share)) for share in (0.25, 0.5, 0.75))
+    rate_hz, scatter = 1.0 / period_s, (longer - shorter) / period_s / math.sqrt(len(steps))  # of the median of uneven steps
+    if model.rate_hz and abs(rate_hz / model.rate_hz - 1.0) > MOST_RATE + SURE * scatter:
+        sentences.append(f"samples at {rate_hz:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
+    return sentences
 
 
 class TemperatureDrift:

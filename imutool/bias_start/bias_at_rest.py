@@ -15,7 +15,7 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import BiasModel, Vector6
-from imutool.bias_start.bias_tracking import FilteredBlock, Samples, filter_blocks
+from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_blocks
 from imutool.bias_start.initial_bias import (
     AT_REST_STD,
     TRACKED_BY,
@@ -31,7 +31,7 @@ from imutool.bias_start.initial_bias import (
 from imutool.bias_start.prior_width import MOST_DEVIATIONS, BiasPrior, supported_std, widened
 from imutool.errors import DataError
 from imutool.inertial.inertial_filter import LEAST_FORCE_M_S2
-from imutool.inertial.innovations import LEAST_DRIVEN_M_S
+from imutool.inertial.innovations import LEAST_DRIVEN_M_S, SURPRISING, innovations
 from imutool.inertial.stationary import MOST_SHAKING, Blocks, rest_stretches, resting_blocks, white_noise
 from imutool.recording import GRAVITY_M_S2, Imu, nanoseconds
 from imutool.recording.columns import true_ranges
@@ -40,6 +40,9 @@ LOOK_AHEAD_S = 60.0  # in which a log that begins in motion may stop: what the s
 REST_BEGINS_WITHIN_S = 5.0  # a later stop would give a bias from the future
 MOST_UNKNOWN = 1e-3  # rad/s, deviation of a bias that may be left unknown: 3 degrees in a minute
 UNTRAINED = BiasPrior(np.zeros(6), np.full(6, np.inf), np.full(6, MOST_UNKNOWN))  # of the change from stop to stop
+UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sensor nobody calibrated (BMI160 of TUM-VI: 1.3)
+REFUTED, SURE, UNUSUAL = 15.0, 3.0, 2.0  # log-likelihood and deviations that refute a stop; deviations that ask for both
+MOST_SURPRISING = 0.05  # share of such innovations; training logs 0.00, other sensors at least 0.05 where bias is no evidence
 PIECE = 512  # samples, of which the search for a stop takes no more than it needs
 
 
@@ -64,6 +67,11 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
     t_s, gyro, accel = relative_samples(imu.rows(slice(0, int(np.searchsorted(imu.t_ns, first_ns + nanoseconds(end_s))))))
     u, at_stop = np.concatenate([gyro, accel], axis=1), t_s >= begin_s
     difference = (u - model.stream(before.mean)(t_s, gyro, accel))[at_stop].mean(axis=0)
+    if np.linalg.norm(difference[:3] / before.std[:3]) > UNUSUAL and refuted_stops(relative_samples(imu)):
+        if not model.card:
+            raise _no_rest()
+        start = tracked_from_prior(model, first_ns)
+        return replace(start, how=f"{start.how}; its stops are steady turns", follows=replace(before, stops=False))
     wide = widened(before.std, difference, _at_rest_variance(model, u[at_stop]))
     if (wide > before.std).any():
         before = replace(before, std=wide)
@@ -196,6 +204,31 @@ def stops_in(samples: Samples) -> list[tuple[float, float]]:
     t_s, gyro, accel = samples
     stops = rest_stretches(Imu(np.round(t_s * 1e9).astype(np.int64), gyro, accel))
     return [(float(t_s[first]), float(t_s[last - 1])) for first, last in stops]
+
+
+def refuted_stops(samples: Samples) -> tuple[Vector6, Vector6] | None:
+    """Bias and its deviation by gravity in motion, where this refutes the first stop.
+
+    A turn about gravity looks like rest. The innovations after it are likelier where all is taken for motion, and the bias
+    about gravity is another one. Of logs of EuRoC, FETCH, BROAD, RepoIMU and a car their log-likelihood is larger by 4 at most.
+    """
+    known = replace(UNTRAINED, std=UNKNOWN_STD, settings=bias_prior(static.Model()).settings)
+    both = [BiasFilter(prior, ahead=True) for prior in (known, replace(known, stops=False))]
+    runs = zip(*([*each.feed(*samples), *each.finish()] for each in both), strict=True)
+    later = list(itertools.dropwhile(lambda blocks: not blocks[0].resting, runs))
+    moving = list(zip(*(blocks for blocks in later if not blocks[0].resting), strict=True))
+    if not moving:
+        return None
+    stopped, moved = (innovations(block.step for block in blocks) for blocks in moving)
+    if (moved.chi_square > SURPRISING).mean() > MOST_SURPRISING:  # of a clipped gyro, which gravity contradicts in any case
+        return None
+    last = moving[1][-1].step.after
+    ends = samples[0].searchsorted((later[0][0].start_s, later[0][0].end_s))
+    rate, force = (u[slice(*ends)].mean(axis=0) for u in samples[1:])
+    up, P = force / np.linalg.norm(force), last.covariance(False)
+    turn, std = up @ (rate - last.bias[:3]), np.sqrt(up @ P[:3, :3] @ up)
+    refuted = moved.log_likelihood.sum() - stopped.log_likelihood.sum() > REFUTED and abs(turn) > SURE * std
+    return (last.bias, np.sqrt(np.diag(P))) if refuted else None
 
 
 def changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], prior: BiasPrior) -> Iterator[str]:

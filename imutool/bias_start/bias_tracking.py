@@ -142,7 +142,7 @@ class BiasFilter:
         """Whether a block that looks like rest has a rate that a bias can have."""
         rate, usual = block.u[:-1, :3].mean(axis=0), MOST_CHANGE[:3]
         own = np.abs(rate - self._prior.mean[:3]) < usual + MOST_DEVIATIONS * self._prior.std[:3]
-        return bool(own.all() or (np.abs(rate) < usual).all())
+        return self._prior.stops and bool(own.all() or (np.abs(rate) < usual).all())
 
     def _pass(self, block: _Block, rests: bool) -> FilteredBlock:
         t, u, s, prior, rests = block.t_s, block.u, self.settings, self._prior, rests and self._rests(block)

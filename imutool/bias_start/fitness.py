@@ -24,15 +24,26 @@ import msgspec
 import numpy as np
 
 from imutool.bias import static
+from imutool.bias.log_binding import other_conditions
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias.model_file import library, shipped_for
 from imutool.bias_start import Fitness
-from imutool.bias_start.bias_at_rest import MOST_UNKNOWN, UNTRAINED, changed_at_rest, shown_at_rest, stops_in
+from imutool.bias_start.bias_at_rest import (
+    MOST_SURPRISING,
+    MOST_UNKNOWN,
+    UNKNOWN_STD,
+    UNTRAINED,
+    changed_at_rest,
+    refuted_stops,
+    shown_at_rest,
+    stops_in,
+)
 from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_together, stops_of
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
 from imutool.bias_start.prior_width import (
     MOST_CHANGE,
     MOST_DEVIATIONS,
+    TELLING,
     BiasPrior,
     contradicted_start,
     most_left,
@@ -42,22 +53,17 @@ from imutool.bias_start.prior_width import (
 )
 from imutool.bias_start.stretches import GRAVITY_RANGE, unusual_gravity
 from imutool.inertial.innovations import SURPRISING, Innovations, Share, innovations, share_of_correction
-from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2
-from imutool.recording.columns import quantile
 
 CHECKED_S = 120.0  # of a log that the check reads
 LEAST_SPEED_M_S, LEAST_PIVOT_M = 1.0, 1e-3  # of the filter: an arm and a tight bound would take up what a wrong scale leaves
-UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sensor nobody calibrated (BMI160 of TUM-VI: 1.3)
-MOST_SURPRISING = 0.05  # share of such innovations; training logs 0.00, other sensors at least 0.05 where bias is no evidence
 MOST_OF_GUESS = np.array([3.0] * 3 + [MOST_DEVIATIONS] * 3)  # the same where few sessions leave the prior's width to a guess
 LEAST_EVIDENCE = -40.0  # log-likelihood of the model against none
 DEPENDENT = 2.0  # ratio of the shown bias's deviation to the filter's, which takes velocities for independent; a hand circles
-MOST_NOISE = 4.0  # ratio to the residuals of the training logs; training logs up to 2.0
-MOST_RATE = 2e-3  # relative difference of sample rates; one unit's clock stays within 1e-4
 HALF, MOST_SHARE = 0.5, 1.5  # of a correction: between them it does more good than harm
 LEAST_SHARE = -2.0  # below, the log lacks so much else that the correction makes it worse by less than half
 LEAST_SHOWN = 0.005  # deviation of a share that a percentage shows
+STEADY_TURN, ONLY_GYRO = "what looks like a stop is a steady turn, by gravity in motion", np.array([0.0] * 3 + [np.inf] * 3)
 SURE, OWN = 3.0, 4.0  # standard deviations; of made-up sensors' own shares, the largest lies 3.8 from one
 
 
@@ -88,7 +94,14 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         return _untrained(start, samples)
     if len(samples[0]) < 2:
         return Fitness("doubtful", ("the log is too short to be judged",))
-    prior = _prior(model)
+    found = _trained(model, start, samples, about)
+    turns = found.verdict != "fits" and refuted_stops(samples)
+    return Fitness(found.verdict, (*found.reasons, STEADY_TURN)) if turns else found
+
+
+def _trained(model: BiasModel, start: InitialBias, samples: Samples, about: Mapping[str, str]) -> Fitness:
+    """Fitness of a trained model."""
+    prior = replace(_prior(model), stops=start.follows is None or start.follows.stops)
     unknown = replace(prior, mean=np.where(np.abs(prior.mean) > UNKNOWN_STD, prior.mean, 0.0), std=UNKNOWN_STD, least=None)
     corrected = _without_motion(model, samples, prior)
     found, none, unstarted = _evidence((corrected, samples, corrected), (prior, unknown, unknown))
@@ -116,7 +129,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         *changed_at_rest(corrected, found.stops, prior),
         *_not_shown(start, found),
         *model.remarks,
-        *_other_conditions(model, samples),
+        *other_conditions(model, samples),
         *_other_unit(model, about),
     ]
     if not (doubts or confirmed or _same_unit(model, about)) and (untold := untold_bias(prior.mean, _shown_std(found, prior))):
@@ -134,6 +147,9 @@ def _untrained(start: InitialBias, samples: Samples) -> Fitness:
     """Fitness of a constant bias, which needs no training, from the stops of a log."""
     units = sorted({path.stem.rpartition("-")[0] for path in library().glob("*.safetensors")})
     other_start, harmful = contradicted_start(start.rest, start.std, *shown_at_rest(samples))
+    if np.linalg.norm(start.rest[:3]) > TELLING[0] / 2.0 and (shown := refuted_stops(samples)):
+        in_motion, turned = contradicted_start(start.rest, start.std, shown[0], DEPENDENT * shown[1] + ONLY_GYRO)
+        other_start, harmful = [*other_start, *in_motion, STEADY_TURN], harmful or turned
     doubts = (*other_start, *changed_at_rest(samples, stops_in(samples), UNTRAINED))
     trained = f"it needs no training; trained models ship for {', '.join(units)}"
     return Fitness("unfit" if harmful else "doubtful" if doubts else "fits", (*doubts, trained))
@@ -170,8 +186,8 @@ def _without_motion(model: BiasModel, samples: Samples, prior: BiasPrior) -> Sam
 
 def _started(start: InitialBias, prior: BiasPrior) -> BiasPrior:
     """Prior with which a start begins; one that the user gives is no part of the model."""
-    measured = replace(prior, mean=start.rest, std=np.maximum(start.std, LEAST_STD)) if start.std.any() else prior
-    return start.follows or measured
+    own = {"mean": start.rest, "std": np.maximum(start.std, LEAST_STD)} if start.std.any() else {}
+    return start.follows or replace(prior, **own)
 
 
 def _evidence(samples: Sequence[Samples], priors: Sequence[BiasPrior]) -> list[_Evidence]:
@@ -233,10 +249,8 @@ def _other_bias(found: _Evidence, prior: BiasPrior, most: Vector6) -> Iterator[s
 def _disagreement(found: _Evidence, none: _Evidence) -> Iterator[str]:
     """Sentence on samples that contradict each other after the correction, unless those of no model do."""
     if found.surprising > MOST_SURPRISING + none.surprising:  # fast vehicles surprise without a model, too
-        yield (
-            f"gyro and gravity disagree after the correction in {found.surprising:.0%} of the half seconds, before it in"
-            f" {none.surprising:.0%}"
-        )
+        half_seconds = f"{found.surprising:.0%} of the half seconds, before it in {none.surprising:.0%}"
+        yield f"gyro and gravity disagree after the correction in {half_seconds}"
 
 
 def _refuted(share: Share) -> Iterator[str]:
@@ -262,20 +276,6 @@ def _worse_than_none(samples: Samples, used: BiasPrior, found: _Evidence, prior:
     return [f"the raw samples agree with gravity and stops better than the corrected, by {-evidence:.0f} in log-likelihood"]
 
 
-def _other_conditions(model: BiasModel, samples: Samples) -> list[str]:
-    """Sentences on noise and sample rate that the training logs did not have."""
-    sentences = []
-    noise = white_noise(np.concatenate([samples[1], samples[2]], axis=1))
-    known = model.noise_std > 0
-    ratio = float((noise[known] / model.noise_std[known]).max()) if known.any() else 0.0
-    if ratio > MOST_NOISE:  # less noise is no doubt: a drone in the hand has a tenth of that in flight
-        sentences.append(f"the samples are {ratio:.0f} times as noisy as in the training runs: another sensor, or vibration")
-    rate_hz = 1.0 / float(quantile(np.diff(samples[0]), 0.5))
-    if model.rate_hz and abs(rate_hz / model.rate_hz - 1.0) > MOST_RATE:
-        sentences.append(f"samples at {rate_hz:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
-    return sentences
-
-
 def _other_unit(model: BiasModel, about: Mapping[str, str]) -> Iterator[str]:
     """Sentences on a log that names another origin than the model's."""
     for key, words in (("sensor", "sensor"), ("dataset", "data set")):
@@ -292,9 +292,8 @@ def _same_unit(model: BiasModel, about: Mapping[str, str]) -> bool:
 
 def _agreement(found: _Evidence, prior: BiasPrior, share: Share) -> str:
     """Sentence on a log that agrees with a model, and on what it does not show."""
-    deviations = _deviations(found, prior).max()
-    agrees = f"the bias that the log shows lies within {deviations:.1f} standard deviations of the training runs"
+    most = f"{_deviations(found, prior).max():.1f} standard deviations"
+    agrees = f"the bias that the log shows lies within {most} of the training runs"
     if math.isinf(share.std):  # nothing is corrected in motion
         return agrees
-    unclear = share.std > HALF
-    return f"{agrees}; {'it does not show the share of the correction in motion' if unclear else _shown_share(share)}"
+    return f"{agrees}; {_shown_share(share) if share.std <= HALF else 'it does not show the share of the correction in motion'}"

@@ -46,7 +46,7 @@ class BiasPrior:
     Bias b in motion, offset at rest (mean zero), and random walk of b.
 
     `walk` is in rad/s and m/s² per second^1/2, `settings` are those of its filter. With `least` the standard deviation of b
-    is only known to lie between that and `std`: the log decides (`supported_std`).
+    is only known to lie between that and `std`: the log decides (`supported_std`). Without `stops` rest is taken for motion.
     """
 
     mean: Vector6
@@ -55,6 +55,7 @@ class BiasPrior:
     walk: Vector6 = field(default_factory=USUAL_WALK.copy)
     least: LeastWidth | None = None
     settings: FilterSettings = field(default_factory=FilterSettings)
+    stops: bool = True
 
     def supported(
         self, states: Sequence[State], elapsed_s: Float64[np.ndarray, " m"], resting: Bool[np.ndarray, " m"]

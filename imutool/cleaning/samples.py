@@ -107,7 +107,7 @@ class Motion:
         self.start_ns: int | None = None
         self.end_ns = 0
         self.samples = 0
-        self._sampled_ns = 0  # without gaps and jumps of the clock
+        self._past_middle_ns = 0  # of all samples, each against the middle of its step
         self._steps: list[Int64[np.ndarray, " m"]] = []
         self._sums: list[Float64[np.ndarray, "m 7"]] = []
         self._open: tuple[int, Float64[np.ndarray, "7"]] | None = None
@@ -116,8 +116,8 @@ class Motion:
 
     @property
     def middle_ns(self) -> int:
-        """Start of the steps for what lies in their middle: the mean of a step's samples is half a period before that."""
-        return (self.start_ns or 0) - self._sampled_ns // max(self.samples - 1, 1) // 2
+        """Start of the steps for what lies in their middle: the mean of a step's samples is up to half a period before that."""
+        return (self.start_ns or 0) + self._past_middle_ns // max(self.samples, 1)
 
     def see(self, samples: Samples) -> None:
         """Add samples, with increasing stamps."""
@@ -125,12 +125,12 @@ class Motion:
             return
         if self.start_ns is None:
             self.start_ns = self.end_ns = int(samples.stamp_ns[0])
-        self._sampled_ns += int(np.minimum(np.diff(samples.stamp_ns, prepend=self.end_ns), STEP_NS).sum())
         self.end_ns = int(samples.stamp_ns[-1])
         if self.samples < MOST_RATES:
             self._rates.append(samples.values[: MOST_RATES - self.samples, :3].copy())
         self.samples += len(samples.number)
-        step = (samples.stamp_ns - self.start_ns) // STEP_NS
+        step, past_ns = np.divmod(samples.stamp_ns - self.start_ns, STEP_NS)
+        self._past_middle_ns += int((past_ns - STEP_NS // 2).sum())
         rows = np.column_stack([np.ones(len(step)), samples.values])
         first = np.flatnonzero(np.diff(step, prepend=step[0] - 1))
         sums, steps = np.add.reduceat(rows, first, axis=0), step[first]

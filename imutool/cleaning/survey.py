@@ -279,7 +279,7 @@ def _reasons(settings: CleaningSettings, whole: TopicSummary, invalid: int, find
         unusable = [f"{finding.count} {finding.what}" for finding in findings if finding.rule == "not_finite"]
         yield from unusable
         if whole.messages >= FEWEST and not whole.motion.end_ns and not unusable:
-            yield f"the stamps were never set: {RESTAMP}"
+            yield f"the stamps were never set: {RESTAMP} takes the log times"
         return
     share = invalid / whole.messages
     if share > settings.max_invalid_share:

@@ -15,6 +15,7 @@ from imutool.cleaning.rules.axes import LATE_STDS, Axes
 from imutool.cleaning.rules.saturation import Saturation
 from imutool.cleaning.rules.stuck import Stuck
 from imutool.cleaning.rules.units import Units
+from imutool.cleaning.stamp_line import read_stamps
 from imutool.cleaning.truth import Truth, truth_of
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.errors import DataError
@@ -29,6 +30,7 @@ from imutool.log_info.pose_imu_rotation import (
     velocities_judged,
 )
 from imutool.log_info.report import Convention, TruthInfo
+from imutool.mcap_io.topics import RESTAMP
 from imutool.recording import GRAVITY_M_S2, Imu, Recording
 
 logger = logging.getLogger(__name__)
@@ -129,12 +131,9 @@ def check_start_poses(recording: Recording) -> float:
     for warning in _warnings(motion, whole):
         what, fix = _apart(warning, truth)
         if fix or (found is not None and unlike(found.explained, found.rms_rad_s)):
-            raise DataError(
-                what,
-                where=f"{recording.name} {recording.imu_topic}",
-                expected="poses and samples of one motion for a start from the truth",
-                fix=f"{fix or 'See imutool info LOG'}, or give another `init`",
-            )
+            expected, fix = "poses and samples of one motion for a start from the truth", fix or "See imutool info LOG"
+            where = f"{recording.name} {recording.imu_topic}"
+            raise DataError(what, where=where, expected=expected, fix=f"{fix}, or give another `init`")
     delay = whole.conventions.delay
     clear = delay is not None and delay.step is None and abs(delay.seconds) > max(START_LATE_S, LATE_STDS * delay.std_s)
     return delay.seconds if delay is not None and clear else 0.0
@@ -190,9 +189,8 @@ def check_one_sensor(recordings: Sequence[Recording]) -> None:
     stated = {r.name: str(r.metadata.get("imutool", {}).get("sensor", "")) for r in recordings}
     if len({sensor for sensor in stated.values() if sensor}) > 1:
         listed = ", ".join(f"{name}: {sensor or 'not stated'}" for name, sensor in stated.items())
-        raise DataError(
-            f"the logs are of different sensors ({listed})", expected="logs of one sensor", fix="Take each sensor by itself"
-        )
+        what = f"the logs are of different sensors ({listed})"
+        raise DataError(what, expected="logs of one sensor", fix="Take each sensor by itself")
 
 
 def warn_of_recordings(recordings: Iterable[Recording]) -> list[TopicSummary]:
@@ -202,13 +200,16 @@ def warn_of_recordings(recordings: Iterable[Recording]) -> list[TopicSummary]:
 
 @np.errstate(over="ignore", invalid="ignore")  # of one sample of 1e160, as a broken driver writes it
 def check_conventions(recordings: Iterable[Recording]) -> None:
-    """Refuse recordings whose units, axes or frames are wrong; log other warnings.
+    """Refuse recordings whose stamps, units, axes or frames are wrong; log other warnings.
 
     Raises:
-        DataError: as `check_motion`.
+        DataError: as `check_motion`, and stamps that are not the sensor's.
     """
     for each in map(velocities_judged, recordings):
-        check_motion(motion_of(each.imu, truth_of(each)), truth_of(each), f"{each.name} {each.imu_topic}")
+        where = f"{each.name} {each.imu_topic}"
+        if faults := read_stamps(each.imu.t_ns).faults:
+            raise DataError(faults[0], where=where, expected="the sensor's own times", fix=f"{RESTAMP} corrects it")
+        check_motion(motion_of(each.imu, truth_of(each)), truth_of(each), where)
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -223,8 +224,7 @@ def check_motion(motion: ImuMotion, truth: Truth | None, where: str) -> None:
     for warning in _warnings(motion, whole):
         what, fix = _apart(warning, truth)
         if fix or warning in wrong:
-            expected = "units, axes and poses that agree"
-            raise DataError(what, where=where, expected=expected, fix=fix or FIX_BY_HAND)
+            raise DataError(what, where=where, expected="units, axes and poses that agree", fix=fix or FIX_BY_HAND)
         logger.warning("%s: %s", where, warning)
 
 

@@ -31,6 +31,7 @@ from imutool.units import SENSORS, Sensor
 
 MAD_TO_STD = 1.4826
 TURN_ON_STD = {"gyro": 5e-3, "accel": 0.1}  # of a switching-on: ADIS16448 2e-3 over four months, BMI160 up to 5e-2 (data sheet)
+MOST_TURN_ON = 11.0  # by the size of the biases themselves: three as small have a chance of one in a thousand
 USUAL_STD = {"gyro": 5e-4, "accel": 2e-2}  # between logs of one switching-on
 MOST_TAIL, LEAST_FREEDOM = 3.0, 0.1  # variance of Student's t: three degrees of freedom, or fewer, count as three
 SESSION_STEP = {"gyro": 3e-3, "accel": 0.3}  # another switching-on: a larger step of the bias from one log to the next
@@ -108,12 +109,15 @@ def turn_on_prior(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[
     Within a session the variance comes from n logs, as many degrees of freedom too few to be known: the next log follows
     Student's t, whose variance is n / (n - 2) times larger, at most `MOST_TAIL`. Where most logs that follow each other closely
     differ all the same, the next log is of a session of its own, and no session is returned. A bias that no log shows is NaN:
-    zero is expected of it, with `TURN_ON_STD`.
+    zero is expected of it, with `TURN_ON_STD`. No size exceeds that of the biases by more than `MOST_TURN_ON`: after another
+    turn-on a fibre-optic gyro has 1e-5 rad/s again.
     """
     known, rest = np.isfinite(rest).all(axis=0), np.nan_to_num(rest)
     groups, broken = _sessions(rest, spans_ns)
     means = np.stack([rest[group].mean(axis=0) for group in groups])
     usual, turn_on = (np.repeat([size[sensor] for sensor in SENSORS], 3) for size in (USUAL_STD, TURN_ON_STD))
+    most = MOST_TURN_ON * np.repeat(np.sqrt((means.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2))), 3)
+    usual, turn_on = (np.where(known, np.minimum(std, most), std) for std in (usual, turn_on))
     squares = sum(((rest[group] - mean) ** 2).sum(axis=0) for group, mean in zip(groups, means, strict=True))
     freedom = len(rest) - len(groups) + 1
     within = (squares + usual**2) / freedom * min(MOST_TAIL, freedom / max(freedom - 2.0, LEAST_FREEDOM))

@@ -1,8 +1,9 @@
-"""Logs that contradict the others: turned axes, another unit or another mount."""
+"""Logs that contradict the others, by axes, unit or mount, and poses that are smoothed."""
 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,8 @@ from imutool.array_types import Float64
 from imutool.bias.model import COLUMNS
 from imutool.bias_start.prior_width import MOST_CHANGE, turned_axes
 from imutool.errors import DataError
+from imutool.geometry import so3
+from imutool.inertial.windows import HUBER_MEDIANS, huber_weight, rotation_residual
 from imutool.recording import nanoseconds
 from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.calibration.effect_selection import LINEAR, Calibration, parameter_columns
@@ -23,6 +26,9 @@ CONTRADICTS = 0.35  # of the error without a matrix, left by a log's own: 30 s w
 MOST_LEFT = (
     0.02  # share of chi-square that turned axes leave; of made-up sensors that turn on 10 to 20 mrad/s apart, 1 in 5000 has it
 )
+SMOOTHED_S, SLOPE_S, MOST_WINDOWS = 0.5, 0.04, 4000  # windows whose ends show smoothing, half the time of a slope, how many
+SURE, TOO_SMALL = 5.0, 0.03  # deviations, and share of a turn; of EuRoC, TUM-VI, FETCH, BROAD, RepoIMU and a car 0.025 at most
+ITERATIONS, RIDGE = 4, 1e-9  # of the weights; share of a square, for what the motion does not show
 LONG_ENOUGH_S = 40.0  # for a calibration of a log alone: shorter logs fit their noise
 
 logger = logging.getLogger(__name__)
@@ -78,6 +84,49 @@ def _name_other_units(names: Sequence[str], bias: Float64[np.ndarray, "logs 3"])
             what = "%s: the gyro's bias about %s is %+.2g rad/s, the median of all logs %+.2g: another unit? %s"
             fix = "Train a model for each unit"
             logger.warning(what, name, "xyz"[axis], own[axis], usual[axis], fix)
+
+
+def warn_of_smoothed_poses(pool: Pool) -> None:
+    """Warn of poses that are means over some time, whose turns teach a wrong scale."""
+    for log, name in enumerate(pool.names):
+        over_s, share = _smoothing(pool, log)
+        if share > TOO_SMALL:
+            what = "%s: the poses are smoothed over about %.2f s: turns of half a second are %.0f %% too small in them, and the"
+            what = f"{what} model learns that as a scale. Train on poses as they were measured"
+            logger.warning(what, name, over_s, 100.0 * share)
+
+
+@torch.no_grad()
+def _smoothing(pool: Pool, log: int) -> tuple[float, float]:
+    """Time over which a log's poses are means, and the share of half a second's turn that this hides.
+
+    The share is zero where it is not clear. Means over T miss the share T^2 / 24 of the second derivative of the attitude: the
+    residual of a window is that share of w'_end - R^T w'_start, beside scale, misalignment, bias, mount and a clock that is off
+    by tau, whose square counts alike.
+    """
+    n, h = pool.samples(SMOOTHED_S), pool.samples(SLOPE_S)
+    first = pool.starts(n, "all", hop=max(1, n // 2))
+    first = first[pool.log[first] == log]
+    first = first[:: -(-len(first) // MOST_WINDOWS) or 1]
+    windows, one = pool.windows(first, n, pool.t.new_zeros(len(first), 6)), torch.eye(3).to(pool.t)
+    R = windows.R_start.mT @ windows.R_end
+    e, turn = rotation_residual(windows.segment.gyro, windows.dt, R)[0], so3.log(R)
+    steps, ends = torch.arange(-h, h + 1).to(pool.t), [pool.gyro[pool.around(end, h, h)] for end in (first, first + n)]
+    slopes = [torch.einsum("k,mki->mi", steps * pool.rate_hz / (steps @ steps), rates) for rates in ends]
+    changes = [at[1] - (R.mT @ at[0][..., None])[..., 0] for at in ([rates.mean(1) for rates in ends], slopes)]
+    by_matrix = torch.einsum("ij,mk->mijk", one, turn).flatten(2)
+    J = torch.cat([by_matrix, one.expand_as(R), R.mT - one, *(change[..., None] for change in changes)], dim=2)
+    left, x, H = e, J.new_zeros(J.shape[2]), J.new_zeros(J.shape[2], J.shape[2])
+    for _ in range(ITERATIONS if len(first) > J.shape[2] else 0):
+        size = left.norm(dim=1)
+        weight = huber_weight(size, HUBER_MEDIANS * size.median().expand_as(size))
+        H = torch.einsum("m,mij,mik->jk", weight, J, J)
+        x = torch.linalg.solve(H + torch.diag(RIDGE * H.diagonal() + RIDGE**2), torch.einsum("m,mij,mi->j", weight, J, e))
+        left = e - J @ x
+    missed = float(x[-1] - 0.5 * x[-2] ** 2)
+    std = float((torch.linalg.pinv(H)[-1, -1] * left.square().mean()).sqrt())
+    share = missed * float(changes[1].norm() / turn.norm()) if missed > SURE * std else 0.0
+    return math.sqrt(24.0 * max(missed, 0.0)), share
 
 
 def contradicting(pool: Pool, fits: Mapping[Sensor, Calibration]) -> tuple[Contradiction, ...]:

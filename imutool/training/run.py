@@ -35,6 +35,7 @@ from imutool.training.calibration.log_scatter import LEAST_GAIN, SURELY
 from imutool.training.candidates import left_out_covariance, simpler_effects
 from imutool.training.fit import Epoch, Training, check_device, note
 from imutool.training.left_out import LEAST_ERROR, beaten, compare
+from imutool.training.log_agreement import warn_of_smoothed_poses
 from imutool.training.log_signals import matrix_covariance, read_parts, with_poses_of_sensor
 from imutool.training.objectives.paper_scheme import PaperTraining
 from imutool.training.settings import TrainSettings, settings_for
@@ -99,11 +100,11 @@ def train(
         logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
     pool = Pool.of(recordings)
     check_trainable(recordings, pool)
+    warn_of_smoothed_poses(pool)
     if "accel" not in pool.sensors:
         names = ", ".join(recording.name for recording in recordings if not recording.truth.has_positions)
-        logger.warning(
-            "the true poses of %s have no positions: the gyro alone is trained, and the accelerometer turned with it", names
-        )
+        what = "the true poses of %s have no positions: the gyro alone is trained, and the accelerometer turned with it"
+        logger.warning(what, names)
     descent = _Descent(kept, resume, device, progress or (lambda epoch: None))
     trainer: Trainer = TRAINERS[method] if method in TRAINERS else partial(_network_alone, method)
     with side_by_side():

@@ -14,7 +14,7 @@ from imutool.bias import linear, static
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import save
 from imutool.bias_start import Fitness, fitness
-from imutool.bias_start.bias_at_rest import auto
+from imutool.bias_start.bias_at_rest import at_rest, auto
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import from_numbers, relative_samples
 from imutool.errors import ModelError
@@ -220,6 +220,34 @@ def test_more_noise_is_doubtful_and_less_is_not(model: BiasModel, recording: Rec
     found = judged(more, recording.imu)
     assert found.verdict == "doubtful"
     assert "5 times as noisy" in found.reasons[0]
+
+
+@pytest.mark.parametrize("untrained", [False, True])
+def test_a_steady_turn_about_gravity_is_no_stop(untrained: bool, model: BiasModel) -> None:
+    """Before the flight the sensor turns at a constant rate, as on a table: it looks like a bias until the sensor tilts."""
+    imu = flight(3, duration_s=60.0, still_s=8.0).imu
+    turns = np.arange(len(imu)) * imu.period_s < 8.5
+    up = imu.accel[turns].mean(axis=0)
+    imu = replace(imu, gyro=imu.gyro + np.outer(turns, 0.08 * up / np.linalg.norm(up)))
+    own = linear.Model(linear.Config(), model.rate_hz, dict(model.tensors) | {"prior_std": 7.0 * model.prior_std})
+    own.card = model.card
+    chosen = static.Model() if untrained else own
+    start = at_rest(chosen, imu) if untrained else auto(chosen, imu)
+    found = judge(chosen, start, [relative_samples(imu)], {})
+    assert found.verdict == ("doubtful" if untrained else "fits"), found
+    assert ("steady turn" in " ".join(found.reasons)) == untrained
+    assert np.linalg.norm(start.rest[:3] - model.prior_mean[:3]) == pytest.approx(0.08 * untrained, abs=5e-3)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.4])
+def test_another_rate_is_a_doubt_where_the_steps_show_it(jitter: float, model: BiasModel, recording: Recording) -> None:
+    """The median step of stamps that jitter scatters by itself."""
+    imu, period_ns = recording.imu, 1e9 * recording.imu.period_s
+    late_ns = np.random.default_rng(6).uniform(-jitter, jitter, len(imu)) * period_ns
+    found = judged(
+        model, Imu(imu.t_ns + (0.005 * period_ns * np.arange(len(imu)) + late_ns).astype(np.int64), imu.gyro, imu.accel)
+    )
+    assert ("Hz, in the training runs at" in " ".join(found.reasons)) == (jitter == 0.0), found
 
 
 def test_an_unfit_model_is_refused_unless_forced_and_a_doubtful_one_is_used(

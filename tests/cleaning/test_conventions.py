@@ -279,6 +279,17 @@ def test_the_clock_of_poses_is_found_however_far_it_is_off(rotation: np.ndarray,
     assert (found.gyro.axes == rotation).all()
 
 
+@pytest.mark.parametrize("rate_hz", [25, 26, 50])
+def test_steps_that_hold_no_whole_number_of_samples_shift_no_clock(rate_hz: int) -> None:
+    """Half a sample is 20 ms at 25 Hz."""
+    made = flight(3, duration_s=40.0, rate_hz=rate_hz)
+    truth = of_poses("/ground_truth/pose", made.truth)
+    assert truth is not None
+    found = judge(motion_of(made.imu), truth, 1.0).delay
+    assert found is not None
+    assert found.seconds == pytest.approx(0.0, abs=0.004)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_one_part_that_errs_does_not_make_a_delay_unsure(seed: int) -> None:
     """A part whose poses are 0.1 s off, as of exchanged markers: the others tell the delay as surely as without it."""

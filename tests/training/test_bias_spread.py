@@ -56,6 +56,14 @@ def test_logs_that_follow_closely_and_differ_say_nothing_of_the_next_one() -> No
     assert (std > TURN_ON_STD["gyro"]).all()
 
 
+def test_a_sensor_without_bias_gets_none_by_a_new_switching_on() -> None:
+    """A fibre-optic gyro: with the width of other sensors gravity in motion gave it a bias of 1e-3 rad/s."""
+    rest = np.concatenate([1e-3 * biases(0.01, 0.01), biases(0.05, 0.05)], axis=1)[:, [0, 1, 2, 6, 7, 8]]
+    std = turn_on_prior(rest, spans(0.0, 1.0)).std
+    assert (std[:3] < 5e-4).all()
+    assert (std[3:] > TURN_ON_STD["accel"]).all()
+
+
 def test_one_log_is_a_session_of_its_own() -> None:
     _, std, _, (session,) = turn_on_prior(biases(0.01), spans(0.0))
     np.testing.assert_allclose(std[:3], np.sqrt(2 * TURN_ON_STD["gyro"] ** 2 + MOST_TAIL * USUAL[0] ** 2))

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from imutool.errors import DataError
+from imutool.log_info.convention_report import check_conventions
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor.made_up_flight import flight
+from imutool.training.log_agreement import warn_of_smoothed_poses
 from imutool.training.training_windows import Pool, check_trainable
 
 
@@ -93,6 +95,26 @@ def test_quaternions_that_are_inverse_or_in_another_order_are_refused(flown: Rec
     poses = replace(flown.truth, q_wb_wxyz=(flown.truth.q_wb_wxyz * sign)[:, order], v_w=None)
     with pytest.raises(DataError, match="do not follow the gyro"):
         checked(replace(flown, truths={"/ground_truth/pose": poses}))
+
+
+@pytest.mark.parametrize("over_s", [0.0, 0.4])
+def test_poses_that_are_means_over_some_time_are_named(over_s: float, caplog: pytest.LogCaptureFixture) -> None:
+    flown = flight(1, duration_s=20.0, attitude_knot_s=0.35)
+    poses, rate_hz = flown.truth, 1.0 / flown.truth.period_s
+    n = 2 * round(0.5 * over_s * rate_hz) + 1
+    mean = np.apply_along_axis(np.convolve, 0, poses.q_wb_wxyz, np.full(n, 1.0 / n), "same")
+    q = mean / np.linalg.norm(mean, axis=1, keepdims=True)
+    kept = slice(n, -n)
+    smoothed = Poses(poses.t_ns[kept], poses.p_wb[kept], q[kept])
+    warn_of_smoothed_poses(Pool.of([replace(flown, truths={"/ground_truth/pose": smoothed})]))
+    assert ("smoothed over about 0.39 s" in caplog.text) == (over_s > 0.0), caplog.text
+
+
+def test_stamps_in_batches_are_refused_before_the_poses_clock_that_they_seem_to_shift(flown: Recording) -> None:
+    imu, row = flown.imu, np.arange(len(flown.imu))
+    stamps = imu.t_ns[np.minimum(row // 5 * 5 + 4, len(imu) - 1)] + 100_000 * (row % 5)
+    with pytest.raises(DataError, match=r"batches of about 5.0 samples.*--restamp corrects it"):
+        check_conventions([replace(flown, imu=Imu(stamps, imu.gyro, imu.accel))])
 
 
 def test_a_few_seconds_are_not_enough() -> None:
