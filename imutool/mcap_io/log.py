@@ -16,7 +16,7 @@ from imutool.errors import DataError, LogError
 from imutool.file_location import Location, location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records, schemas
-from imutool.mcap_io.codec.decode import PoseBatch
+from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch
 from imutool.mcap_io.codec.joined_imu import choice_of, no_imu_fix, parse_parts, whole_of
 from imutool.mcap_io.codec.records import HEAD, keep_buffers
 from imutool.mcap_io.index import LogIndex
@@ -26,6 +26,7 @@ from imutool.mcap_io.topics import (
     ENCODINGS,
     MESSAGE_POSES,
     PART_KEY,
+    StampCheck,
     Topic,
     joined_topic,
     reflected_topics,
@@ -106,11 +107,7 @@ class Log:
         return [t.name for t in found if t.count] or [t.name for t in found]
 
     def only_imu(self) -> str:
-        """The log's IMU, where there is exactly one.
-
-        Raises:
-            LogError: there are others, or none.
-        """
+        """The log's IMU, where there is exactly one; LogError of others, or none."""
         found = self.imu_topics
         if not found:
             raise self.no_imu()
@@ -182,11 +179,7 @@ class Log:
         return found
 
     def metadata_records(self) -> list[tuple[str, dict[str, str]]]:
-        """Every metadata record, in file order.
-
-        Raises:
-            LogError: one of them is damaged.
-        """
+        """Every metadata record, in file order; LogError of a damaged one."""
         found = []
         with self.named():
             for item in self.index.items:
@@ -225,8 +218,16 @@ class Log:
             listed = {channel: self.index.entries(block, channel) for channel in channels & block.indexes.keys()}
             if listed and all(map(len, listed.values())):
                 return listed
-        found = self.index.unpack_or_lose(block)
-        return {} if found is None else found.entries(channels)
+        return {} if (found := self.index.unpack_or_lose(block)) is None else found.entries(channels)
+
+    def imu_batches(self, topic: str) -> Iterator[ImuBatch]:
+        """The messages of an IMU topic in file order; LogError as `topic`, of NaN, stamps that do not increase, or damage."""
+        described, stamps = self.topic(topic, (schemas.IMU,)), StampCheck()
+        for _, rows in self.rows([described.name]):
+            with self.named(described.name):
+                for batch in described.decode_imu(rows):
+                    stamps.check_imu(batch)
+                    yield batch
 
     def pose_batches(self, topic: str, end_ns: int | None = None) -> Iterator[PoseBatch]:
         """The poses of a topic in file order; of a TFMessage one batch per transform in it; LogError as `topic`."""
