@@ -23,11 +23,13 @@ from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.passthrough.chunk_check import KeptChunks, neighbours, unpack_together
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.topics import (
+    CLEAN_FIX,
     ENCODINGS,
     MESSAGE_POSES,
     PART_KEY,
     StampCheck,
     Topic,
+    check_finite,
     joined_topic,
     reflected_topics,
     topics_of,
@@ -112,8 +114,7 @@ class Log:
         if not found:
             raise self.no_imu()
         if len(found) > 1:
-            what = f"the log has {len(found)} IMU topics: {', '.join(found)}"
-            raise LogError(what, where=self.path, fix=choice_of(found))
+            raise LogError(f"the log has {len(found)} IMU topics: {', '.join(found)}", where=self.path, fix=choice_of(found))
         return found[0]
 
     def no_imu(self) -> LogError:
@@ -140,10 +141,7 @@ class Log:
     def topic(self, name: str, schema_names: Collection[str]) -> Topic:
         """A topic by name, with one of these message types in an encoding that imutool reads.
 
-        `gyro=TOPIC,accel=TOPIC` joins two topics to one IMU, and logs the delay between them.
-
-        Raises:
-            LogError: no such topic, other messages, or another encoding.
+        `gyro=TOPIC,accel=TOPIC` joins two topics to one IMU, and logs the delay between them. LogError if there is none such.
         """
         if (parts := parse_parts(name)) is not None:
             return self._join(*(self.topic(part, (schemas.IMU, *schemas.VECTORS)) for part in parts))
@@ -222,11 +220,12 @@ class Log:
 
     def imu_batches(self, topic: str) -> Iterator[ImuBatch]:
         """The messages of an IMU topic in file order; LogError as `topic`, of NaN, stamps that do not increase, or damage."""
-        described, stamps = self.topic(topic, (schemas.IMU,)), StampCheck()
+        described, stamps = self.topic(topic, (schemas.IMU,)), StampCheck(fix=CLEAN_FIX)
         for _, rows in self.rows([described.name]):
             with self.named(described.name):
                 for batch in described.decode_imu(rows):
-                    stamps.check_imu(batch)
+                    check_finite(batch, CLEAN_FIX, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
+                    stamps.check(batch.stamp_ns, batch.sequence)
                     yield batch
 
     def pose_batches(self, topic: str, end_ns: int | None = None) -> Iterator[PoseBatch]:
