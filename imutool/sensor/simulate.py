@@ -179,19 +179,21 @@ def simulated(
     stamps = [even_stamps(ideal, rate_hz) for ideal in ideals]
     started_s = None if start_ns is None else (start_ns - motion.start_ns) * 1e-9
     out = taken(ideals, stamps, [*acting, (additive_noise(noise, rate_hz, seed), np.zeros(0))], started_s)
-    inside = motion.covers(source.truth.t_ns)
     return Simulation(
         Recording(
             name=source.name,
             imu=Imu(_nanoseconds(motion, out.stamp_s), out.gyro, out.accel),
-            truths={TRUTH_TOPIC: source.truth.rows(inside), MOTION_TOPIC: _exact(motion, ideals, stamps)},
+            truths={
+                TRUTH_TOPIC: source.truth.rows(motion.covers(source.truth.t_ns)),
+                MOTION_TOPIC: _exact(motion, ideals, stamps),
+            },
             scalars=dict(source.scalars) if needed else {},
             source=source.source,
         ),
         motion,
         tuple((part.start_s, part.end_s) for part in motion.stretches),
         {"rate_hz": rate_hz, "seed": seed},
-        (*_of_poses(motion, source.truth, ideals), *of_noise(noise, rate_hz)),
+        (*_of_poses(motion, source.truth, ideals, 1.0 - len(out.stamp_s) / sum(map(len, stamps))), *of_noise(noise, rate_hz)),
     )
 
 
@@ -242,9 +244,10 @@ def _nanoseconds(motion: SmoothMotion, stamp_s: Float64[np.ndarray, " m"]) -> In
     return np.asarray(motion.start_ns + np.round(stamp_s * 1e9).astype(np.int64))
 
 
-def _of_poses(motion: SmoothMotion, poses: Poses, ideals: Sequence[IdealMotion]) -> Iterator[str]:
-    left_out = poses.duration_s - motion.duration_s
-    if left_out > 0.05 * poses.duration_s:
+def _of_poses(motion: SmoothMotion, poses: Poses, ideals: Sequence[IdealMotion], lost: float) -> Iterator[str]:
+    if lost > 0.05:
+        yield f"{100.0 * lost:.0f} % of the samples are left out: the clock takes them outside the motion"
+    if (left_out := poses.duration_s - motion.duration_s) > 0.05 * poses.duration_s:
         yield f"{left_out:.1f} s of {poses.duration_s:.1f} s are left out: holes and glitches of the poses, and their ends"
     force = float(median(np.concatenate([quaternion.length(ideal.accel) for ideal in ideals])))
     if force > MOST_M_S2:
@@ -296,5 +299,6 @@ def _without_imu(log: Log, truth: str | None) -> Recording:
     t_ns, p_wb, q_wb = (np.concatenate([part[k] for part in parts]) for k in (3, 4, 5))
     with log.named(topic):
         poses = Poses(t_ns, p_wb, unit_quaternions(q_wb))
-    none = Imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
-    return Recording(name=log.path.stem, imu=none, truths={name: poses})
+    return Recording(
+        name=log.path.stem, imu=Imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3))), truths={name: poses}
+    )
