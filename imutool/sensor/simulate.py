@@ -173,20 +173,17 @@ def simulated(
             fix="Give a longer trajectory",
         )
     ideals = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
-    needed = needs_channels(acting)
-    if needed:
+    if needed := needs_channels(acting):
         ideals = [replace(ideal, channels=channels_at(source, ideal.t_s, motion.start_ns)) for ideal in ideals]
     stamps = [even_stamps(ideal, rate_hz) for ideal in ideals]
     started_s = None if start_ns is None else (start_ns - motion.start_ns) * 1e-9
     out = taken(ideals, stamps, [*acting, (additive_noise(noise, rate_hz, seed), np.zeros(0))], started_s)
+    inside = motion.covers(source.truth.t_ns)
     return Simulation(
         Recording(
             name=source.name,
             imu=Imu(_nanoseconds(motion, out.stamp_s), out.gyro, out.accel),
-            truths={
-                TRUTH_TOPIC: source.truth.rows(motion.covers(source.truth.t_ns)),
-                MOTION_TOPIC: _exact(motion, ideals, stamps),
-            },
+            truths={TRUTH_TOPIC: source.truth.rows(inside), MOTION_TOPIC: _exact(motion, ideals, stamps)},
             scalars=dict(source.scalars) if needed else {},
             source=source.source,
         ),
@@ -299,6 +296,5 @@ def _without_imu(log: Log, truth: str | None) -> Recording:
     t_ns, p_wb, q_wb = (np.concatenate([part[k] for part in parts]) for k in (3, 4, 5))
     with log.named(topic):
         poses = Poses(t_ns, p_wb, unit_quaternions(q_wb))
-    return Recording(
-        name=log.path.stem, imu=Imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3))), truths={name: poses}
-    )
+    none = Imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+    return Recording(name=log.path.stem, imu=none, truths={name: poses})
