@@ -120,7 +120,7 @@ class Malformed:
 
 
 def decoded(text: bytes | str, arrival_s: float, malformed: Malformed) -> Iterator[Sample | None]:
-    """The sample of a message; None if it holds none, so that a source of such messages is not waited for."""
+    """The sample of a message; None if it holds none, so that time is looked at."""
     try:
         if isinstance(text, bytes) and text.startswith(CDR):
             imu = decode_imu(np.frombuffer(text, np.uint8)[None])
