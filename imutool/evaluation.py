@@ -76,15 +76,12 @@ def evaluate(
     """
     if trajectories is not None:
         _refuse_twins(models)
-    asked = None if aid is None else parse_aids(aid)
-    results = list[dict[str, Any]]()
+    asked, results = None if aid is None else parse_aids(aid), list[dict[str, Any]]()
     stretches = read_stretches(log, imu=imu, truth=truth)
     release_memory()
     in_log = [None] * len(stretches) if models else _debiased(log, stretches, truth)
     for stretch, debiased in zip(stretches, in_log, strict=True):
-        recording = replace(stretch, imu=measured_imu(stretch.imu, f"{log} {stretch.imu_topic}"))
-        if by := debiased_by(stretch.metadata.get("imutool", {}), stretch.imu_topic):
-            logger.warning("%s: `%s` is debiased already, by %s: a model corrects it once more", stretch.name, RAW, by)
+        recording = measured_once(stretch, log)
         aids = None
         if asked is not None:
             with Log(log) as opened:
@@ -94,6 +91,13 @@ def evaluate(
     return results
 
 
+def measured_once(recording: Recording, log: Path) -> Recording:
+    """Recording of the measured samples; warns of others, and of debiased ones."""
+    if by := debiased_by(recording.metadata.get("imutool", {}), recording.imu_topic):
+        logger.warning("%s: `%s` is debiased already, by %s: a model corrects it once more", recording.name, RAW, by)
+    return replace(recording, imu=measured_imu(recording.imu, f"{log} {recording.imu_topic}"))
+
+
 def debiased_by(about: Mapping[str, str], topic: str) -> str:
     """Name of the model that has debiased an IMU already; empty for a raw one.
 
@@ -101,8 +105,7 @@ def debiased_by(about: Mapping[str, str], topic: str) -> str:
     """
     from imutool.debiasing import DEBIASED_BY, SUFFIX
 
-    is_derived = topic == f"{about.get('source_topic')}{SUFFIX}"
-    return about.get(DEBIASED_BY) or (about.get("model", "") if is_derived else "")
+    return about.get(DEBIASED_BY) or (about.get("model", "") if topic == f"{about.get('source_topic')}{SUFFIX}" else "")
 
 
 def _debiased(log: Path, stretches: Sequence[Recording], truth: str | None) -> Sequence[Imu | None]:

@@ -134,8 +134,8 @@ def write_template(name: str, folder: Path) -> list[Path]:
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise ConfigError(f"{name!r}", where="name", expected="lower-case letters, digits and underscores")
-    if name in registry.names(GROUP):
-        raise ConfigError(f"{name!r} is taken", where="name", expected=f"none of {', '.join(registry.names(GROUP))}")
+    if name in (taken := ["auto", *registry.names(GROUP)]):
+        raise ConfigError(f"{name!r} is taken", where="name", expected=f"none of {', '.join(taken)}")
     texts = {"pyproject.toml": PROJECT, f"imutool_{name}.py": MODULE, f"test_{name}.py": TEST}
     if folder.exists():
         raise ConfigError("exists", where=folder, fix="Choose another folder")

@@ -45,6 +45,7 @@ def write(source: Path, out: Path, form: str, noise: str | Path | None, overwrit
         left_out += [entry.name for entry in twin.physics.effect if entry.name in twin.used and sets_in(entry)]
         left_out += [f"a curve of {curve.variable}" for curve in twin.physics.unknown] + [t.term for t in twin.physics.term]
         left_out += ["the colour of the noise"] * (twin.noise.colour is not None)
+        left_out += [f"the sample rate, which no noise file tells: {twin.rate_hz:g} Hz are assumed"] * (not twin.rate_known)
     left_out += twin.of_some
     return ExportReport(out, form, None, dict.fromkeys(texts, 1), left_out)
 

@@ -26,7 +26,7 @@ from imutool.units import AXES, SENSORS, Sensor, three
 
 PHYSICS, NOISE = "physics.toml", "noise.toml"
 MOST_BIAS_M_S2 = 0.6 * GRAVITY_M_S2  # of an accelerometer; with a larger one it measures no gravity
-RATE_HZ = 200.0  # of a sensor whose rate neither the given noise nor the diagnosed one says
+RATE_HZ = 200.0  # of a sensor whose rate neither the diagnosed noise nor the given one says
 DEVIATIONS = 2.0  # of a range
 Vector = Float64[np.ndarray, "3"]
 
@@ -35,7 +35,8 @@ Vector = Float64[np.ndarray, "3"]
 class Twin:
     """Sensor of a fleet: physics, spread of the bias, noise.
 
-    `used` are the effects expressed, `of_some` those that the fleet as a whole has not.
+    `used` are the effects expressed, `of_some` those that the fleet as a whole has not. A rate that is not
+    `rate_known` is assumed.
     """
 
     physics: PhysicsFile
@@ -43,6 +44,7 @@ class Twin:
     noise: Noise
     units: int
     rate_hz: float = RATE_HZ
+    rate_known: bool = True
     of_some: tuple[str, ...] = ()
     used: set[str] = field(default_factory=set)
 
@@ -114,9 +116,10 @@ def read(source: Path, noise: str | Path | None = None) -> Twin:
     mean = Bias(**{s: three(rows.mean(axis=0)) for s, rows in known.items()}) if known else None
     std: dict[Sensor, Vector] = {s: rows.std(axis=0, ddof=1) if len(rows) > 1 else np.zeros(3) for s, rows in biases.items()}
     physics, of_some = (files[0], ()) if len(files) == 1 else _of_fleet(files)
-    rates = [each.colour.rate_hz for each in (sheet, *noises) if each.colour is not None]
-    rate_hz = next(iter(rates), RATE_HZ)
-    return Twin(msgspec.structs.replace(physics, bias=mean), std, sheet, len(files), rate_hz, of_some)
+    own = (sheet, *noises) if noise is None else (*noises, sheet)  # a given noise is often of another sensor
+    rates = [each.colour.rate_hz for each in own if each.colour is not None]
+    physics = msgspec.structs.replace(physics, bias=mean)
+    return Twin(physics, std, sheet, len(files), next(iter(rates), RATE_HZ), bool(rates), of_some)
 
 
 def _titled(entries: Iterable[Entry]) -> Iterator[tuple[str, Entry]]:

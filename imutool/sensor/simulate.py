@@ -173,8 +173,7 @@ def simulated(
             fix="Give a longer trajectory",
         )
     ideals = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
-    needed = needs_channels(acting)
-    if needed:
+    if needed := needs_channels(acting):
         ideals = [replace(ideal, channels=channels_at(source, ideal.t_s, motion.start_ns)) for ideal in ideals]
     stamps = [even_stamps(ideal, rate_hz) for ideal in ideals]
     started_s = None if start_ns is None else (start_ns - motion.start_ns) * 1e-9
@@ -191,7 +190,7 @@ def simulated(
         motion,
         tuple((part.start_s, part.end_s) for part in motion.stretches),
         {"rate_hz": rate_hz, "seed": seed},
-        (*_of_poses(motion, source.truth, ideals), *of_noise(noise, rate_hz)),
+        (*_of_poses(motion, source.truth, ideals, 1.0 - len(out.stamp_s) / sum(map(len, stamps))), *of_noise(noise, rate_hz)),
     )
 
 
@@ -242,9 +241,10 @@ def _nanoseconds(motion: SmoothMotion, stamp_s: Float64[np.ndarray, " m"]) -> In
     return np.asarray(motion.start_ns + np.round(stamp_s * 1e9).astype(np.int64))
 
 
-def _of_poses(motion: SmoothMotion, poses: Poses, ideals: Sequence[IdealMotion]) -> Iterator[str]:
-    left_out = poses.duration_s - motion.duration_s
-    if left_out > 0.05 * poses.duration_s:
+def _of_poses(motion: SmoothMotion, poses: Poses, ideals: Sequence[IdealMotion], lost: float) -> Iterator[str]:
+    if lost > 0.05:
+        yield f"{100.0 * lost:.0f} % of the samples are left out: the clock takes them outside the motion"
+    if (left_out := poses.duration_s - motion.duration_s) > 0.05 * poses.duration_s:
         yield f"{left_out:.1f} s of {poses.duration_s:.1f} s are left out: holes and glitches of the poses, and their ends"
     force = float(median(np.concatenate([quaternion.length(ideal.accel) for ideal in ideals])))
     if force > MOST_M_S2:

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from imutool import config
 from imutool.array_types import Bool, Int64
 from imutool.errors import DataError, NumericsError
-from imutool.evaluation import runs
+from imutool.evaluation import measured_once, runs
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import StartPose, with_velocity
 from imutool.log_info.convention_report import check_conventions
@@ -83,7 +83,7 @@ def vio(
     """
     smoother.load()
     chosen = settings or VioSettings()
-    recording = read(log, imu=imu, truth=truth)
+    recording = measured_once(read(log, imu=imu, truth=truth), log)
     check_conventions([recording])
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))

@@ -34,7 +34,7 @@ def test_an_installed_template_is_known_to_convert(imutool, tmp_path, monkeypatc
 
 
 def test_names_that_are_taken_or_no_names_are_refused(imutool, tmp_path):
-    for name in ("euroc", "My-Logger"):
+    for name in ("euroc", "auto", "My-Logger"):
         assert imutool("new-converter", name, cwd=tmp_path).returncode == 3
     (tmp_path / "imutool-a").mkdir()
     assert imutool("new-converter", "a", cwd=tmp_path).returncode == 3

@@ -105,15 +105,23 @@ def test_gazebo_has_pose_noise_walk_and_digits_by_axis(tmp_path: Path) -> None:
     np.testing.assert_allclose(read["stddev"], 3e-3 * np.sqrt(RATE_HZ), rtol=1e-6)
 
 
-def test_a_data_sheets_noise_has_the_rate_of_the_diagnosed_sensor(tmp_path: Path) -> None:
+def test_a_given_noise_has_the_rate_of_the_diagnosed_sensor(tmp_path: Path) -> None:
     """A density says nothing of a sample without the rate."""
-    export(diagnosed(tmp_path / "d"), tmp_path / "out", format="gazebo", noise="bmi160")
-    sensor = ElementTree.parse(tmp_path / "out" / "imu.sdf").getroot().find("model/link/sensor")
-    assert sensor is not None
-    assert float(sensor.findtext("update_rate") or "") == RATE_HZ
-    density = datasheet.read("bmi160").values("gyro_density")[0]
-    stddev = sensor.findtext("imu/angular_velocity/x/noise/stddev")
-    np.testing.assert_allclose(float(stddev or ""), density * np.sqrt(RATE_HZ), rtol=1e-6)
+    folder, other = diagnosed(tmp_path / "d"), tmp_path / "other.toml"
+    assert NOISE.colour is not None
+    datasheet.write(msgspec.structs.replace(NOISE, colour=msgspec.structs.replace(NOISE.colour, rate_hz=100.0)), other)
+    for noise in ("bmi160", other):
+        report = export(folder, tmp_path / "out", format="gazebo", noise=noise, overwrite=True)
+        sensor = ElementTree.parse(tmp_path / "out" / "imu.sdf").getroot().find("model/link/sensor")
+        assert sensor is not None
+        assert float(sensor.findtext("update_rate") or "") == RATE_HZ
+        density = datasheet.read(noise).values("gyro_density")[0]
+        stddev = sensor.findtext("imu/angular_velocity/x/noise/stddev")
+        np.testing.assert_allclose(float(stddev or ""), density * np.sqrt(RATE_HZ), rtol=1e-6)
+        assert not any("rate" in text for text in report.left_out)
+    (folder / "noise.toml").unlink()
+    report = export(folder, tmp_path / "out", format="gazebo", noise="bmi160", overwrite=True)
+    assert any("200 Hz are assumed" in text for text in report.left_out)
 
 
 class Recorded:

@@ -151,6 +151,8 @@ def test_a_shift_of_the_clock_takes_samples_later_and_leaves_out_those_beyond_th
     ideal, late = (along(accelerating, acting).imu for acting in ([], [planted("shift", Stage.CLOCK, lambda t, _: t + 0.05)]))
     np.testing.assert_allclose(late.accel[:, 0], elapsed(late) + 0.05, atol=ACCEL)
     assert len(ideal) - len(late) == 10  # 0.05 s at 200 Hz: none is held at its last value
+    half = simulated(recording(accelerating), [planted("shift", Stage.CLOCK, lambda t, _: t + 0.5 * T[-1])], NONE, RATE_HZ, 0)
+    assert any("of the samples are left out: the clock takes them" in remark for remark in half.remarks)
 
 
 def test_the_clock_and_the_sensor_know_of_no_holes() -> None:

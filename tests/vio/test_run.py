@@ -124,6 +124,20 @@ def test_the_same_seed_gives_the_same_figures_and_another_seed_others(results: l
     assert figures(1)["aoe_deg"] != results[0]["aoe_deg"]
 
 
+def test_samples_that_are_no_measurement_or_debiased_already_are_named(
+    perfect: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """One reading of 1e30 m/s² ended every run."""
+    accel = perfect.imu.accel.copy()
+    accel[200] = 1e30
+    derived = {"imutool": {"debiased_by": "static"}}
+    write(replace(perfect, imu=Imu(perfect.imu.t_ns, perfect.imu.gyro, accel), metadata=derived), tmp_path / "log.mcap")
+    (raw,) = vio(tmp_path / "log.mcap", bias_states=(True,), settings=VioSettings(duration_s=2.0))
+    assert raw["failed"] is None
+    assert "left out: 1 beyond any sensor" in caplog.text
+    assert "debiased already, by static" in caplog.text
+
+
 def test_a_run_that_fails_does_not_stop_the_others(perfect: Recording, tmp_path: Path) -> None:
     """What no estimate survives is in the raw samples; six numbers given as the start take it off."""
     off = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 500.0])

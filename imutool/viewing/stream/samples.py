@@ -108,6 +108,10 @@ class Malformed:
     count: int = 0
     first: str = ""
 
+    def __str__(self) -> str:
+        """The count and the first reason, to follow a sentence; empty without such a message."""
+        return f"; the first of {self.count} messages: {self.first}" if self.count else ""
+
     def add(self, text: bytes | str, error: Exception) -> None:
         """Count a message."""
         self.count += 1
@@ -115,13 +119,14 @@ class Malformed:
             self.first = f"{error}: {text[:100]!r}"
 
 
-def decoded(text: bytes | str, arrival_s: float, malformed: Malformed) -> Iterator[Sample]:
-    """The sample of a message, if it holds one."""
+def decoded(text: bytes | str, arrival_s: float, malformed: Malformed) -> Iterator[Sample | None]:
+    """The sample of a message; None if it holds none, so that time is looked at."""
     try:
         if isinstance(text, bytes) and text.startswith(CDR):
             imu = decode_imu(np.frombuffer(text, np.uint8)[None])
             yield Sample(int(imu.stamp_ns[0]), tuple(imu.gyro[0].tolist()), tuple(imu.accel[0].tolist()), arrival_s)
-        elif text.strip():
-            yield sample(text, arrival_s)
+        else:
+            yield sample(text, arrival_s) if text.strip() else None
     except (msgspec.DecodeError, UnicodeDecodeError, ValueError, OverflowError, RecursionError, LogError) as error:
         malformed.add(text, error)
+        yield None

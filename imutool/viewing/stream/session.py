@@ -21,10 +21,12 @@ from imutool.bias_start.bias_at_rest import auto
 from imutool.bias_start.correction import OnlineDebiaser
 from imutool.bias_start.earlier_load import after_load, with_earlier_load
 from imutool.bias_start.initial_bias import model_samples
+from imutool.bias_start.stretches import measured
 from imutool.debiasing import DebiasedBlock
 from imutool.errors import DataError
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording.columns import clock_jumps, jump_warnings
+from imutool.units import SENSORS
 from imutool.viewing.stream import Delay, StreamStatistics
 from imutool.viewing.stream.samples import MOST_NS, Malformed, Sample
 from imutool.viewing.stream.sources import Samples, timely
@@ -63,7 +65,7 @@ def run(
     session = _Session(model, each, force)
     with _showing(show) as batches:
         try:
-            for found in timely(source, seconds):
+            for found in timely(source, seconds, malformed):
                 session.add(found, batches)
         except (KeyboardInterrupt, SystemExit):  # Ctrl-C; `timeout` or a service: what came so far is kept
             pass
@@ -127,8 +129,7 @@ class _Session:
             DataError: no samples.
         """
         if not self._samples:
-            why = f"; the first of {malformed.count} messages: {malformed.first}" if malformed.count else ""
-            raise DataError(f"it sent no samples{why}", where=STREAM, expected='{"t_ns": …, "gyro": […], "accel": […]}')
+            raise DataError(f"it sent no samples{malformed}", where=STREAM, expected='{"t_ns": …, "gyro": […], "accel": […]}')
         steps, steady_ns = self._samples - 1 - self._gaps, self._last_ns - self._begin_ns - self._gap_ns
         return StreamStatistics(
             samples=self._samples,
@@ -207,8 +208,6 @@ class _Session:
         self._bias = bias
         assert self._fit is not None
         self._fit.add(found)
-        if not np.isfinite(u).all():
-            self._not_measured += 1
         if self._each is not None:
             self._each(found, rate, force)
         self._batch.append((found, bias))
@@ -216,8 +215,10 @@ class _Session:
             batches.put(self._block())
 
     def _block(self) -> list[tuple[Sample, np.ndarray, np.ndarray]]:
-        """Samples of the batch with bias and deviation."""
-        block = [(found, bias, self._std) for found, bias in self._batch]
+        """Measured samples of the batch with bias and deviation."""
+        good = measured(*(np.array([getattr(found, name) for found, _ in self._batch]).reshape(-1, 3) for name in SENSORS))
+        self._not_measured += int((~good).sum())
+        block = [(found, bias, self._std) for (found, bias), kept in zip(self._batch, good.tolist(), strict=True) if kept]
         self._batch = []
         return block
 
@@ -268,12 +269,12 @@ def _showing(show: Show | None) -> Iterator[_Batches]:
 
 
 def _show_all(batches: Iterable[list[tuple[Sample, np.ndarray, np.ndarray]]], show: Show) -> None:
-    """Show each batch; samples that are not newer than those before, or not measured, are left out."""
+    """Show each batch; samples that are not newer than those before are left out."""
     last_ns, count = -MOST_NS - 1, 0
     for batch in batches:
         rows = []
         for row in batch:
-            if row[0].stamp_ns > last_ns and np.isfinite(row[0].gyro).all() and np.isfinite(row[0].accel).all():
+            if row[0].stamp_ns > last_ns:
                 rows.append(row)
                 last_ns = row[0].stamp_ns
         if not rows:

@@ -56,8 +56,8 @@ def open_source(
     return samples
 
 
-def timely(source: Samples, seconds: float | None) -> Iterator[Sample]:
-    """Samples until the time is up; warns of a silent source once."""
+def timely(source: Samples, seconds: float | None, malformed: Malformed) -> Iterator[Sample]:
+    """Samples until the time is up; warns once of a source without any."""
     began = last = time.perf_counter()
     warned = False
     for found in source:
@@ -69,7 +69,7 @@ def timely(source: Samples, seconds: float | None) -> Iterator[Sample]:
             yield found
         elif not warned and now - last > SILENT_S:
             warned = True
-            logger.warning("The source has sent nothing for %.0f s; still waiting. Ctrl-C ends it", now - last)
+            logger.warning("The source has sent no sample for %.0f s%s. Still waiting; Ctrl-C ends it", now - last, malformed)
 
 
 def _source(name: str, malformed: Malformed, imu: str | None, speed: float, temperature: str | None) -> Samples:
@@ -151,6 +151,7 @@ def _lines(malformed: Malformed) -> Samples:
             if len(rest) > MAX_BYTES:
                 malformed.add(rest, ValueError("a line without an end"))
                 rest = b""
+                yield None
 
     return samples()
 

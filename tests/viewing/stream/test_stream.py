@@ -108,14 +108,14 @@ def test_gaps_order_and_missing_values_are_counted_and_do_no_harm(imu: Imu) -> N
     t_ns, gyro = imu.t_ns.copy(), imu.gyro.copy()
     t_ns[1000:] += 3_000_000_000  # a gap
     t_ns[1200] = t_ns[1198]
-    gyro[1300] = np.nan
+    gyro[1300], gyro[1400] = np.nan, 1e300  # no gyro reads this: it is no measurement, either
     rows = [Sample(t, tuple(g), tuple(a), 0.0) for t, g, a in zip(t_ns.tolist(), gyro, imu.accel, strict=True)]
     shown: list[Any] = []
     done = run(iter([None, *rows]), api.load_model("static"), Malformed(), show=shown.append)
-    assert (done.gaps, done.out_of_order, done.not_measured) == (1, 1, 1)
+    assert (done.gaps, done.out_of_order, done.not_measured) == (1, 1, 2)
     assert done.rate_hz == pytest.approx(1.0 / imu.period_s, rel=0.01)  # not less for the gap
     stamps = np.concatenate([block.batch.stamp_ns for block in shown])
-    assert len(stamps) == len(imu) - 2
+    assert len(stamps) == len(imu) - 3
     assert (np.diff(stamps) > 0).all()
     assert np.isfinite(done.gyro_bias).all()
 
@@ -214,8 +214,19 @@ def test_a_clock_that_jumps_at_each_sample_does_not_delay_the_start_for_ever(imu
 @pytest.mark.parametrize("time", ['"t_s": 1e300', '"t_ns": 9223372036854775807', '"t_ns": 99999999999999999999999'])
 def test_a_time_out_of_range_is_no_sample(time: str) -> None:
     malformed = Malformed()
-    assert list(decoded(PLAIN.replace('"t_ns": 5', time), 0.0, malformed)) == []
+    assert list(decoded(PLAIN.replace('"t_ns": 5', time), 0.0, malformed)) == [None]
     assert malformed.count == 1
+
+
+def test_a_source_of_other_messages_is_named_and_ends_in_time(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(sources, "SILENT_S", 0.1)
+    malformed = Malformed()
+    others = (found for _ in range(10**6) for found in decoded('{"ax": 1}', 0.0, malformed))
+    assert list(sources.timely(iter(others), 0.3, malformed)) == []
+    assert malformed.count < 10**6
+    assert "no sample for 0 s; the first of" in caplog.text
 
 
 def test_a_stream_without_samples_and_one_without_rest_say_what_to_do(imu: Imu) -> None:
@@ -282,8 +293,8 @@ def test_datagrams_are_samples(imu: Imu, monkeypatch: pytest.MonkeyPatch) -> Non
     assert next(source) is None
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.sendto("\n".join([lines(imu)[0], "nonsense", lines(imu)[1]]).encode(), ("127.0.0.1", port))
-    found = [one for one in (next(source) for _ in range(2)) if one is not None]
-    assert [one.stamp_ns for one in found] == imu.t_ns[:2].tolist()
+    found = [next(source) for _ in range(3)]
+    assert [one and one.stamp_ns for one in found] == [imu.t_ns[0], None, imu.t_ns[1]]
     assert malformed.count == 1
     source.close()  # type: ignore[attr-defined]
 
@@ -350,7 +361,7 @@ def test_zenoh_carries_json_and_cdr(imu: Imu) -> None:
         publisher.put(b"nonsense")
         for row in encode_imu(imu.t_ns[1:3], imu.gyro[1:3], imu.accel[1:3], "imu"):  # as rmw_zenoh publishes
             publisher.put(row.tobytes())
-        found = [next(source) for _ in range(3)]
+        found = [next(source) for _ in range(4)]
         source.close()  # type: ignore[attr-defined]
     assert [one.stamp_ns for one in found if one is not None] == imu.t_ns[:3].tolist()
     np.testing.assert_array_equal([one.gyro for one in found if one is not None], imu.gyro[:3])
