@@ -28,7 +28,6 @@ PERMUTATIONS = sorted(  # all 48 signed permutations, those that change fewest a
     (np.eye(3)[list(order)] * np.array(signs)[:, None] for order, signs in AXES_ORDERS),
     key=lambda P: float(np.abs(P - np.eye(3)).sum()),
 )
-RIGHT = np.array([1.0, 1.0, 0.0])  # of the parts in a right simulation
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +43,7 @@ class Hypotheses:
 
     def frame(self, y: Vectors) -> tuple[str, Matrix]:
         """Frame of a signal, and its axes P: the simplest that explains as much as any."""
-        squares = self._squares(y)
+        squares = self._squares(y, scaled=True)
         least = max(min(entry[0] for entry in squares), 1e-9 * float((y**2).sum()))  # an exact sensor leaves rounding
         if least > CLEARLY * squares[0][0]:
             return squares[0][2:]
@@ -57,45 +56,59 @@ class Hypotheses:
         as_read, turned = (min(each[0] for each in self._squares(y * by)) / (size * by**2) for by in (1.0, other))
         return other if turned < CLEARLY * min(as_read, 1.0) else 1.0
 
-    def _squares(self, y: Vectors) -> list[tuple[float, int, str, Matrix]]:
-        """What each frame and P leaves of a signal, with its rank: the ideal sensor is the first."""
+    def _squares(self, y: Vectors, *, scaled: bool = False) -> list[tuple[float, int, str, Matrix]]:
+        """What each frame and P leaves of a signal, with its rank: the ideal sensor is the first.
+
+        The motion may be `scaled`, as that of another clock is.
+        """
         out: list[tuple[float, int, str, Matrix]] = []
-        for frame, x in self.frames.items():
-            each = zip(PERMUTATIONS, _least(y, x, PERMUTATIONS, free_bias=self.free_bias), strict=True)
+        frames = list(self.frames.items())
+        for turned, (frame, x) in [(False, each) for each in frames] + [(True, each) for each in frames[: self.turns]]:
+            axes = [P for P in self._turned(y, x) if not is_signed(P)] if turned else PERMUTATIONS
+            each = zip(axes, _least(y, x, axes, free_bias=self.free_bias, scaled=scaled), strict=True)
             out += [(left, len(out) + rank, frame, P) for rank, (P, left) in enumerate(each)]
-        if not self.turns:
-            return out
-        frame, x = next(iter(self.frames.items()))
-        P = self._turned(y, x @ RIGHT[: x.shape[2]])
-        if not is_signed(P):
-            out.append((_least(y, x, [P], free_bias=self.free_bias)[0], len(out), frame, P))
         return out
 
-    def _turned(self, y: Vectors, x: Vectors) -> Matrix:
-        """Rotation of a signal to what a right sensor reads: Wahba's problem (SIAM Review 7, 1965)."""
-        y, x = (part - part.mean(axis=0) if self.free_bias else part for part in (y, x))
-        U, _, Vt = np.linalg.svd(y.T @ x)
-        return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt)
+    def _turned(self, y: Vectors, x: Parts) -> list[Matrix]:
+        """Rotations, then reflections, of parts to a signal: Wahba's problem (SIAM Review 7, 1965)."""
+        out = []
+        for handed in (1.0, -1.0):
+            for weight in _weights(x):
+                of_y, of_x = (part - part.mean(axis=0) if self.free_bias else part for part in (y, x @ np.array(weight)))
+                U, _, Vt = np.linalg.svd(of_y.T @ of_x)
+                out.append(np.asarray(U @ np.diag([1.0, 1.0, handed * np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt))
+        return out
+
+
+def nearest_signed(P: Matrix) -> Matrix:
+    """Signed axes from which others are turned least; the first of several."""
+    return max(PERMUTATIONS, key=lambda signed: float(np.trace(P @ signed.T)))
 
 
 def is_signed(P: Matrix) -> bool:
     """Whether axes are signed ones, up to a small angle."""
-    return max(float(np.trace(P @ signed.T)) for signed in PERMUTATIONS) > 1.0 + 2.0 * math.cos(LEAST_TURN)
+    return float(np.trace(P @ nearest_signed(P).T)) > 1.0 + 2.0 * math.cos(LEAST_TURN)
 
 
-def _least(y: Vectors, x: Parts, axes: Sequence[Matrix], *, free_bias: bool) -> list[float]:
-    """Least squares of y P by its parts, for each P: the rate; or acceleration, gravity (0, 1, 2, -1) and transport term."""
-    weights = (
-        [(1.0,)] if x.shape[2] == 1 else [*((1.0, g, c) for g in (1.0, 0.0, 2.0, -1.0) for c in (0.0, 1.0)), (0.0, 1.0, 0.0)]
-    )
+def _weights(x: Parts) -> list[tuple[float, ...]]:
+    """Weights of the parts: the rate; or acceleration, gravity (1, 0, 2, -1) and transport term."""
+    if x.shape[2] == 1:
+        return [(1.0,)]
+    return [*((1.0, g, c) for g in (1.0, 0.0, 2.0, -1.0) for c in (0.0, 1.0)), (0.0, 1.0, 0.0)]
+
+
+def _least(y: Vectors, x: Parts, axes: Sequence[Matrix], *, free_bias: bool, scaled: bool) -> list[float]:
+    """Least squares of y P by its parts, for each P; the first part may be `scaled`."""
+    weights = _weights(x)
     flat, n, s = x.reshape(-1, x.shape[2]), len(y), float((y**2).sum())
     G, both = flat.T @ flat, y.T @ x.reshape(n, -1)  # of y and x, whatever P
     mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
     out = []
     for P in axes:
         g, best = np.einsum("ji,jip->p", P, both.reshape(3, *x.shape[1:])), np.inf
-        for weight in weights:
-            w = np.array(weight)
+        for w in [np.array(weight) for weight in weights]:
+            if scaled and w[0]:
+                w[0] = max(float(g[0] - G[0, 1:] @ w[1:]) / max(float(G[0, 0]), 1e-300), 0.0)
             mean = mean_y @ P - mean_x @ w
             left = 0.0 if free_bias else float(np.sum(np.maximum(np.abs(mean) - MOST_BIAS, 0.0) ** 2))
             best = min(best, s - 2.0 * float(w @ g) + float(w @ G @ w) - n * (float(mean @ mean) - left))
