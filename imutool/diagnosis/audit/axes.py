@@ -17,6 +17,7 @@ from imutool.array_types import Float64
 CLEARLY = 0.5  # of the squares of the ideal sensor, up to which another unit, frame or axes are chosen
 ALIKE = 1.1  # times the least squares: hypotheses that explain as much, of which the simplest is taken
 LEAST_TURN = 0.05  # rad, from signed axes: less is a mount's misalignment
+UNSEEN = 1e-4  # of the products of signal and parts: less tells no rotation, as that about the only axis of a planar motion
 MOST_BIAS = 1.0  # m/s², of the accelerometer: gravity in the world frame is none
 
 Vectors = Float64[np.ndarray, "n 3"]
@@ -75,7 +76,8 @@ class Hypotheses:
         for handed in (1.0, -1.0):
             for weight in _weights(x):
                 of_y, of_x = (part - part.mean(axis=0) if self.free_bias else part for part in (y, x @ np.array(weight)))
-                U, _, Vt = np.linalg.svd(of_y.T @ of_x)
+                B = of_y.T @ of_x
+                U, _, Vt = np.linalg.svd(B + UNSEEN * np.linalg.norm(B) * np.diag([1.0, handed, 1.0]))
                 out.append(np.asarray(U @ np.diag([1.0, 1.0, handed * np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt))
         return out
 
@@ -106,9 +108,12 @@ def _least(y: Vectors, x: Parts, axes: Sequence[Matrix], *, free_bias: bool, sca
     out = []
     for P in axes:
         g, best = np.einsum("ji,jip->p", P, both.reshape(3, *x.shape[1:])), np.inf
-        for w in [np.array(weight) for weight in weights]:
-            if scaled and w[0]:
-                w[0] = max(float(g[0] - G[0, 1:] @ w[1:]) / max(float(G[0, 0]), 1e-300), 0.0)
+        ways = [np.array(weight) for weight in weights]
+        if scaled:
+            about, size = g - n * (mean_y @ P) @ mean_x, G - n * mean_x.T @ mean_x
+            free = [max(float(about[0] - size[0, 1:] @ w[1:]) / max(float(size[0, 0]), 1e-300), 0.0) for w in ways]
+            ways += [np.array([m, *w[1:]]) for m, w in zip(free, ways, strict=True) if w[0]]
+        for w in ways:
             mean = mean_y @ P - mean_x @ w
             left = 0.0 if free_bias else float(np.sum(np.maximum(np.abs(mean) - MOST_BIAS, 0.0) ** 2))
             best = min(best, s - 2.0 * float(w @ g) + float(w @ G @ w) - n * (float(mean @ mean) - left))

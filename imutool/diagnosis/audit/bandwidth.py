@@ -59,15 +59,11 @@ def _is_mean(
 def most_filter_delay(residual: Float64[np.ndarray, "n 3"], samples: Float64[np.ndarray, "m 3"]) -> float:
     """Most delay (sample periods) of a filter that the noise shows; 0 for white noise.
 
-    Quartiles of short segments are those between two impacts; in long ones a line, as a rotor makes it, stands apart.
+    Quartiles of short segments are those between two impacts.
     """
-    return max(_delay_by(residual, samples, size) for size in (SHORT, SEGMENT))
-
-
-def _delay_by(residual: Float64[np.ndarray, "n 3"], samples: Float64[np.ndarray, "m 3"], size: int) -> float:
     both = []
     for x in (residual, samples):
-        f, _, parts = spectrogram(x, 1.0, window="hann", nperseg=min(size, len(x)), axis=0)
+        f, _, parts = spectrogram(x, 1.0, window="hann", nperseg=min(SHORT, len(x)), axis=0)
         both.append(np.quantile(parts, 0.25, axis=-1))
     sides = [_falls(f, power, 0.5) for power in both]
     if not all(middle * near < FALLS and max(middle, near) < STEP for middle, near in sides):

@@ -35,9 +35,10 @@ BLOCK_S = 2.0  # of the robust covariance
 SHOWN, ORDER = 0.5, 4  # of a curve's cut-off, up to which it follows a motion to 2 %; of the filter
 LEAST_BLOCK = 4.0  # periods of the highest frequency in a block, so that blocks are independent
 BANDS = (1.0, 0.5, 0.25)  # of the band that the poses show: a curve follows the slower motion better
-MOST_ALIKE = 0.9  # correlation of neighbouring blocks
+MOST_ALIKE = 0.98  # correlation of neighbouring blocks
 AGREE = 3.0  # standard deviations by which two bands may differ
 RIDGE = 1e-6  # of biases and misalignment: a body that stays level shows them and gravity alike, and gravity is the larger
+SMALL = 0.01  # rad, or a share: deviation of misalignment and scales before they are fitted
 MOST_SMALL = 0.06  # rad, or a share, that is a sensor's error: more is none of a right one
 LEAST_COSINE = 1e-3  # of the pitch, towards which rates of roll and yaw grow without bound
 LEAST_S = 5.0
@@ -207,12 +208,15 @@ def _in_band(
     A = A / size
     weight, q = np.ones(len(y)), x.shape[2]
     ridge = np.diag([1e-9] * p + [RIDGE] * (q - p))
+    small, alike = np.arange(p + 3, q), max(0.5 / (k.band_hz * k.period_s), 1.0)  # samples, of which one is independent
     for _ in range(3):
         H = (A * weight[:, None, None]).reshape(-1, q).T @ A.reshape(-1, q) + ridge
         theta = np.linalg.solve(H, np.einsum("n,nap,na->p", weight, A, target))
         left = target - A @ theta
         length = np.sqrt((left**2).sum(axis=1))
         weight = 1.0 / np.maximum(1.0, length / max(3.0 * float(np.median(length)), 1e-12))
+        variance = alike * float((weight * length**2).sum()) / (3.0 * float(weight.sum()))
+        ridge[small, small] = RIDGE + variance / (SMALL * size[small]) ** 2
     half = np.linalg.solve(H, by_block(k, np.einsum("n,nap,na->np", weight, A, left)).T)
     std = of_sum(half) / size
     std[~np.isfinite(size)] = np.inf

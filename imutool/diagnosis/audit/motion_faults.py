@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imutool.diagnosis.audit.axes import is_signed, nearest_signed
+from imutool.diagnosis.audit.axes import LEAST_TURN, is_signed, nearest_signed
 from imutool.diagnosis.audit.faults import FaultFound, found
 from imutool.diagnosis.audit.motion import KinematicFit, Kinematics, by_block, of_sum
 from imutool.diagnosis.audit.timing import NEAR, clear, timing_faults, with_unit
@@ -75,7 +75,9 @@ def _frame_faults(k: Kinematics, fit: KinematicFit) -> list[FaultFound]:
     }
     out = [found(fault, signal) for fault, each in flags.items() for signal in _which(each)]
     turns = {sensor: _turn(k, fit, sensor) for sensor, s in zip(SENSORS, signed, strict=True) if not s}
-    return out + [found("turned_axes", s, **turn) for s, turn in turns.items() if any(clear(angle) for angle in turn.values())]
+    least = LEAST_TURN / np.sqrt(3.0)  # about one of the axes
+    certain = [s for s, turn in turns.items() if any(clear(angle) and abs(angle.value) > least for angle in turn.values())]
+    return out + [found("turned_axes", sensor, **turns[sensor]) for sensor in certain]
 
 
 def _turn(k: Kinematics, fit: KinematicFit, sensor: Sensor) -> dict[str, Estimate]:
