@@ -49,7 +49,8 @@ class Hypotheses:
         if least > CLEARLY * squares[0][0]:
             return squares[0][2:]
         chosen = min((entry for entry in squares if entry[0] <= ALIKE * least), key=lambda entry: entry[1])
-        return chosen[2:]
+        frame, P = chosen[2:]
+        return frame, nearest_signed(P) if is_signed(P) else P
 
     def unit(self, y: Vectors, other: float) -> float:
         """1, or another factor, if the signal times it is explained clearly better."""
@@ -65,7 +66,7 @@ class Hypotheses:
         out: list[tuple[float, int, str, Matrix]] = []
         frames = list(self.frames.items())
         for turned, (frame, x) in [(False, each) for each in frames] + [(True, each) for each in frames[: self.turns]]:
-            axes = [P for P in self._turned(y, x) if not is_signed(P)] if turned else PERMUTATIONS
+            axes = self._turned(y, x) if turned else PERMUTATIONS
             each = zip(axes, _least(y, x, axes, free_bias=self.free_bias, scaled=scaled), strict=True)
             out += [(left, len(out) + rank, frame, P) for rank, (P, left) in enumerate(each)]
         return out

@@ -53,7 +53,8 @@ def unexplained(k: Kinematics, fit: KinematicFit, faults: Sequence[FaultFound]) 
 
 def _clock_faults(estimates: Mapping[str, Estimate]) -> list[FaultFound]:
     s, m, k = (estimates[name] for name in ("scale", "m", "k"))
-    alike = abs(m.value - s.value**2) < NEAR * abs(s.value**2 - 1.0) and min(abs(k.value - whole) for whole in (1, *GRAVITY)) < LEAST_CLOCK
+    whole = min(abs(k.value - times) for times in (1, *GRAVITY)) < LEAST_CLOCK
+    alike = abs(m.value - s.value**2) < NEAR * abs(s.value**2 - 1.0) and whole
     other = abs(s.value - 1.0) > LEAST_CLOCK and clear(s, 1.0) and clear(m, 1.0)
     return [found("other_clock", "both", s=s)] if alike and other else []
 
@@ -67,7 +68,7 @@ def _arm_faults(estimates: Mapping[str, Estimate]) -> list[FaultFound]:
 def _frame_faults(k: Kinematics, fit: KinematicFit) -> list[FaultFound]:
     flipped = any(np.linalg.det(P) < 0.0 for P in fit.axes)
     signed = [is_signed(P) for P in fit.axes]
-    other = [np.linalg.det(P) < 0.0 or s and not np.allclose(P, np.eye(3)) for P, s in zip(fit.axes, signed, strict=True)]
+    other = [np.linalg.det(P) < 0.0 or (s and not np.allclose(P, np.eye(3))) for P, s in zip(fit.axes, signed, strict=True)]
     flags = {
         "world_frame": [frame == "world" for frame in fit.frames],
         "euler_rates": [frame == "euler" for frame in fit.frames],
