@@ -211,9 +211,7 @@ def test_two_faults_of_axes_clock_and_gravity_are_both_named(
 
 
 @pytest.mark.parametrize(("seed", "turns", "moves"), [(7, 1.0, 0.02), (6, 1.0, 0.02), (6, 0.3, 0.05)])
-def test_a_misaligned_sensor_has_no_other_point_and_a_planar_motion_shows_no_turn(
-    seed: int, turns: float, moves: float
-) -> None:
+def test_misalignment_is_no_lever_arm_and_a_planar_motion_shows_no_turn(seed: int, turns: float, moves: float) -> None:
     rng, t = np.random.default_rng(seed), np.arange(3200) / 100.0
     motion = bench.Motion.drawn(rng)
     motion.angles[0] *= 0.3
