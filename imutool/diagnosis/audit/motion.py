@@ -232,7 +232,7 @@ def by_block(k: Kinematics, x: Float64[np.ndarray, "n p"]) -> Float64[np.ndarray
 
 
 def of_sum(blocks: Float64[np.ndarray, "p b"]) -> Float64[np.ndarray, " p"]:
-    """Deviation of a sum over blocks, as of a first-order autoregression: neighbours are alike where a bias walks."""
+    """Deviation of a sum over blocks, which as in a first-order autoregression may be alike."""
     square, n = (blocks**2).sum(axis=1), blocks.shape[1]
     alike = np.clip((blocks[:, 1:] * blocks[:, :-1]).sum(axis=1) / np.maximum(square, 1e-300), 0.0, MOST_ALIKE)
     return np.asarray(np.sqrt(square * (1.0 + alike) / (1.0 - alike) * n / max(n - 2, 1)))
