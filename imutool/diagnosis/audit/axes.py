@@ -18,6 +18,7 @@ CLEARLY = 0.5  # of the squares of the ideal sensor, up to which another unit, f
 ALIKE = 1.1  # times the least squares: hypotheses that explain as much, of which the simplest is taken
 LEAST_TURN = 0.05  # rad, from signed axes: less is a mount's misalignment
 UNSEEN = 1e-4  # of the products of signal and parts: less tells no rotation, as that about the only axis of a planar motion
+LEAST_SEEN = 0.01  # of these products, of the axis that moves least beside a turned reflection
 MOST_BIAS = 1.0  # m/s², of the accelerometer: gravity in the world frame is none
 
 Vectors = Float64[np.ndarray, "n 3"]
@@ -78,7 +79,9 @@ class Hypotheses:
             for weight in _weights(x):
                 of_y, of_x = (part - part.mean(axis=0) if self.free_bias else part for part in (y, x @ np.array(weight)))
                 B = of_y.T @ of_x
-                U, _, Vt = np.linalg.svd(B + UNSEEN * np.linalg.norm(B) * np.diag([1.0, handed, 1.0]))
+                U, seen, Vt = np.linalg.svd(B + UNSEEN * np.linalg.norm(B) * np.diag([1.0, handed, 1.0]))
+                if handed < 0.0 and seen[2] < LEAST_SEEN * seen[0]:  # a planar motion shows no reflection
+                    continue
                 out.append(np.asarray(U @ np.diag([1.0, 1.0, handed * np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt))
         return out
 
