@@ -17,6 +17,8 @@ from imutool.array_types import Float64
 CLEARLY = 0.5  # of the squares of the ideal sensor, up to which another unit, frame or axes are chosen
 ALIKE = 1.1  # times the least squares: hypotheses that explain as much, of which the simplest is taken
 LEAST_TURN = 0.05  # rad, from signed axes: less is a mount's misalignment
+UNSEEN = 1e-4  # of the products of signal and parts: less tells no rotation, as that about the only axis of a planar motion
+LEAST_SEEN = 0.01  # of these products, of the axis that moves least beside a turned reflection
 MOST_BIAS = 1.0  # m/s², of the accelerometer: gravity in the world frame is none
 
 Vectors = Float64[np.ndarray, "n 3"]
@@ -28,7 +30,6 @@ PERMUTATIONS = sorted(  # all 48 signed permutations, those that change fewest a
     (np.eye(3)[list(order)] * np.array(signs)[:, None] for order, signs in AXES_ORDERS),
     key=lambda P: float(np.abs(P - np.eye(3)).sum()),
 )
-RIGHT = np.array([1.0, 1.0, 0.0])  # of the parts in a right simulation
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +45,13 @@ class Hypotheses:
 
     def frame(self, y: Vectors) -> tuple[str, Matrix]:
         """Frame of a signal, and its axes P: the simplest that explains as much as any."""
-        squares = self._squares(y)
+        squares = self._squares(y, scaled=True)
         least = max(min(entry[0] for entry in squares), 1e-9 * float((y**2).sum()))  # an exact sensor leaves rounding
         if least > CLEARLY * squares[0][0]:
             return squares[0][2:]
         chosen = min((entry for entry in squares if entry[0] <= ALIKE * least), key=lambda entry: entry[1])
-        return chosen[2:]
+        frame, P = chosen[2:]
+        return frame, nearest_signed(P) if is_signed(P) else P
 
     def unit(self, y: Vectors, other: float) -> float:
         """1, or another factor, if the signal times it is explained clearly better."""
@@ -57,45 +59,65 @@ class Hypotheses:
         as_read, turned = (min(each[0] for each in self._squares(y * by)) / (size * by**2) for by in (1.0, other))
         return other if turned < CLEARLY * min(as_read, 1.0) else 1.0
 
-    def _squares(self, y: Vectors) -> list[tuple[float, int, str, Matrix]]:
-        """What each frame and P leaves of a signal, with its rank: the ideal sensor is the first."""
+    def _squares(self, y: Vectors, *, scaled: bool = False) -> list[tuple[float, int, str, Matrix]]:
+        """What each frame and P leaves of a signal, with its rank: the ideal sensor is the first.
+
+        The motion may be `scaled`, as that of another clock is.
+        """
         out: list[tuple[float, int, str, Matrix]] = []
-        for frame, x in self.frames.items():
-            each = zip(PERMUTATIONS, _least(y, x, PERMUTATIONS, free_bias=self.free_bias), strict=True)
+        frames = list(self.frames.items())
+        for turned, (frame, x) in [(False, each) for each in frames] + [(True, each) for each in frames[: self.turns]]:
+            axes = self._turned(y, x) if turned else PERMUTATIONS
+            each = zip(axes, _least(y, x, axes, free_bias=self.free_bias, scaled=scaled), strict=True)
             out += [(left, len(out) + rank, frame, P) for rank, (P, left) in enumerate(each)]
-        if not self.turns:
-            return out
-        frame, x = next(iter(self.frames.items()))
-        P = self._turned(y, x @ RIGHT[: x.shape[2]])
-        if not is_signed(P):
-            out.append((_least(y, x, [P], free_bias=self.free_bias)[0], len(out), frame, P))
         return out
 
-    def _turned(self, y: Vectors, x: Vectors) -> Matrix:
-        """Rotation of a signal to what a right sensor reads: Wahba's problem (SIAM Review 7, 1965)."""
-        y, x = (part - part.mean(axis=0) if self.free_bias else part for part in (y, x))
-        U, _, Vt = np.linalg.svd(y.T @ x)
-        return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt)
+    def _turned(self, y: Vectors, x: Parts) -> list[Matrix]:
+        """Rotations, then reflections, of parts to a signal: Wahba's problem (SIAM Review 7, 1965)."""
+        out = []
+        for handed in (1.0, -1.0):
+            for weight in _weights(x):
+                of_y, of_x = (part - part.mean(axis=0) if self.free_bias else part for part in (y, x @ np.array(weight)))
+                B = of_y.T @ of_x
+                U, seen, Vt = np.linalg.svd(B + UNSEEN * np.linalg.norm(B) * np.diag([1.0, handed, 1.0]))
+                if handed < 0.0 and seen[2] < LEAST_SEEN * seen[0]:  # a planar motion shows no reflection
+                    continue
+                out.append(np.asarray(U @ np.diag([1.0, 1.0, handed * np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt))
+        return out
+
+
+def nearest_signed(P: Matrix) -> Matrix:
+    """Signed axes from which others are turned least; the first of several."""
+    return max(PERMUTATIONS, key=lambda signed: float(np.trace(P @ signed.T)))
 
 
 def is_signed(P: Matrix) -> bool:
     """Whether axes are signed ones, up to a small angle."""
-    return max(float(np.trace(P @ signed.T)) for signed in PERMUTATIONS) > 1.0 + 2.0 * math.cos(LEAST_TURN)
+    return float(np.trace(P @ nearest_signed(P).T)) > 1.0 + 2.0 * math.cos(LEAST_TURN)
 
 
-def _least(y: Vectors, x: Parts, axes: Sequence[Matrix], *, free_bias: bool) -> list[float]:
-    """Least squares of y P by its parts, for each P: the rate; or acceleration, gravity (0, 1, 2, -1) and transport term."""
-    weights = (
-        [(1.0,)] if x.shape[2] == 1 else [*((1.0, g, c) for g in (1.0, 0.0, 2.0, -1.0) for c in (0.0, 1.0)), (0.0, 1.0, 0.0)]
-    )
+def _weights(x: Parts) -> list[tuple[float, ...]]:
+    """Weights of the parts: the rate; or acceleration, gravity (1, 0, 2, -1) and transport term."""
+    if x.shape[2] == 1:
+        return [(1.0,)]
+    return [*((1.0, g, c) for g in (1.0, 0.0, 2.0, -1.0) for c in (0.0, 1.0)), (0.0, 1.0, 0.0)]
+
+
+def _least(y: Vectors, x: Parts, axes: Sequence[Matrix], *, free_bias: bool, scaled: bool) -> list[float]:
+    """Least squares of y P by its parts, for each P; the first part may be `scaled`."""
+    weights = _weights(x)
     flat, n, s = x.reshape(-1, x.shape[2]), len(y), float((y**2).sum())
     G, both = flat.T @ flat, y.T @ x.reshape(n, -1)  # of y and x, whatever P
     mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
     out = []
     for P in axes:
         g, best = np.einsum("ji,jip->p", P, both.reshape(3, *x.shape[1:])), np.inf
-        for weight in weights:
-            w = np.array(weight)
+        ways = [np.array(weight) for weight in weights]
+        if scaled:
+            about, size = g - n * (mean_y @ P) @ mean_x, G - n * mean_x.T @ mean_x
+            free = [max(float(about[0] - size[0, 1:] @ w[1:]) / max(float(size[0, 0]), 1e-300), 0.0) for w in ways]
+            ways += [np.array([m, *w[1:]]) for m, w in zip(free, ways, strict=True) if w[0]]
+        for w in ways:
             mean = mean_y @ P - mean_x @ w
             left = 0.0 if free_bias else float(np.sum(np.maximum(np.abs(mean) - MOST_BIAS, 0.0) ** 2))
             best = min(best, s - 2.0 * float(w @ g) + float(w @ G @ w) - n * (float(mean @ mean) - left))

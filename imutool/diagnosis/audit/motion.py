@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
@@ -34,11 +35,17 @@ BLOCK_S = 2.0  # of the robust covariance
 SHOWN, ORDER = 0.5, 4  # of a curve's cut-off, up to which it follows a motion to 2 %; of the filter
 LEAST_BLOCK = 4.0  # periods of the highest frequency in a block, so that blocks are independent
 BANDS = (1.0, 0.5, 0.25)  # of the band that the poses show: a curve follows the slower motion better
+MOST_ALIKE = 0.98  # correlation of neighbouring blocks
 AGREE = 3.0  # standard deviations by which two bands may differ
-BIAS_RIDGE = 1e-6  # of a bias: a body that stays level shows it and gravity alike, and gravity is the larger
+RIDGE = 1e-6  # of biases and misalignment: a body that stays level shows them and gravity alike, and gravity is the larger
+SMALL = 0.01  # rad, or a share: deviation of misalignment and scales before they are fitted
+MOST_SMALL = 0.06  # rad, or a share, that is a sensor's error: more is none of a right one
 LEAST_COSINE = 1e-3  # of the pitch, towards which rates of roll and yaw grow without bound
 LEAST_S = 5.0
 OTHER_UNIT: Mapping[Sensor, float] = {"gyro": np.pi / 180.0, "accel": 9.80665}  # deg/s, standard gravity
+MISALIGNMENT = np.array(  # and scales of the axes: the 8 matrices of which none changes all scales alike
+    [*(np.outer(a, b) for a, b in permutations(np.eye(3), 2)), np.diag([1.0, -1.0, 0.0]), np.diag([1.0, 1.0, -2.0])]
+)
 NAMES = ("m", "k", "c", "x", "y", "z", "tau_a", "tau_f")
 
 
@@ -129,11 +136,13 @@ def kinematic_fit(k: Kinematics) -> KinematicFit:
     if accel_frame == "world":  # there neither gravity nor the transport term nor the attitude is anything of its own
         columns = np.einsum("nij,njp->nip", k.R_wb, columns)
         columns[:, :, [2, 7]] = 0.0
-    theta, std, left_accel = _solved(k, k.accel @ P_accel, columns, np.array([1.0, 1.0] + [0.0] * 6))
+        force = np.einsum("nij,nj->ni", k.R_wb, force)
+    small = np.einsum("nj,qij->niq", force, MISALIGNMENT)
+    theta, std, left_accel = _solved(k, k.accel @ P_accel, columns, np.array([1.0, 1.0] + [0.0] * 6), small)
     estimates = {name: Estimate(float(a), float(s), "-") for name, a, s in zip(NAMES, theta, std, strict=True)}
     slope = k.alpha if gyro_frame == "body" else np.gradient(rates[gyro_frame], k.t_s, axis=0)
     columns = np.stack([rates[gyro_frame], -slope], axis=2)
-    theta, std, left_gyro = _solved(k, k.gyro @ P_gyro, columns, np.array([1.0, 0.0]))
+    theta, std, left_gyro = _solved(k, k.gyro @ P_gyro, columns, np.array([1.0, 0.0]), columns[:, :, :0])
     estimates["scale"], estimates["tau_g"] = (Estimate(float(a), float(s), "-") for a, s in zip(theta, std, strict=True))
     residual = np.concatenate([left_gyro, left_accel], axis=1)
     return KinematicFit(estimates, (gyro_frame, accel_frame), (P_gyro, P_accel), residual)
@@ -161,18 +170,22 @@ def _of_accel(k: Kinematics, parts: Float64[np.ndarray, "n 3 p"]) -> Hypotheses:
 
 
 def _solved(
-    k: Kinematics, y: Vectors, x: Float64[np.ndarray, "n 3 p"], ideal: Float64[np.ndarray, " p"]
+    k: Kinematics,
+    y: Vectors,
+    x: Float64[np.ndarray, "n 3 p"],
+    ideal: Float64[np.ndarray, " p"],
+    small: Float64[np.ndarray, "n 3 q"],
 ) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"], Vectors]:
-    """Coefficients with deviations, and the whole residual.
+    """Coefficients with deviations, and what they and the biases leave; `small` errors of the sensor are fitted beside them.
 
     A part is the same at every frequency. What smoothing takes of a motion grows at least with the square of its frequency, and
     looks like a part. So where slower bands contradict the whole one (Hausman's test), the difference tells this error of each
     band, and the band with the least deviation of both kinds is taken.
     """
     p = x.shape[2]
-    whole, target = np.concatenate([x, np.tile(np.eye(3), (len(y), 1, 1))], axis=2), y - x @ ideal
+    whole, target = np.concatenate([x, np.tile(np.eye(3), (len(y), 1, 1)), small], axis=2), y - x @ ideal
     bands = sorted({max(share * k.band_hz, LEAST_BLOCK / BLOCK_S) for share in BANDS}, reverse=True)
-    each = [_in_band(replace(k, band_hz=band_hz), target, whole) for band_hz in bands]
+    each = [_in_band(replace(k, band_hz=band_hz), target, whole, p) for band_hz in bands]
     theta, std = (np.array(values) for values in zip(*each, strict=True))
     square = (np.array(bands)[:, None] / bands[0]) ** 2
     with np.errstate(invalid="ignore"):  # of parts that the motion does not show, whose deviation is infinite
@@ -180,30 +193,46 @@ def _solved(
     apart = np.abs(theta - theta[0])
     error = np.max(np.where(apart > by_chance, apart, 0.0)[1:] / (1.0 - square[1:]), axis=0, initial=0.0)
     total = np.hypot(std, square * error)
-    best = total.argmin(axis=0), np.arange(p + 3)
-    return ideal + theta[best][:p], total[best][:p], np.asarray(target - whole @ theta[0])
+    best = total.argmin(axis=0), np.arange(len(total[0]))
+    taken = np.concatenate([theta[0, : p + 3], np.clip(theta[0, p + 3 :], -MOST_SMALL, MOST_SMALL)])
+    return ideal + theta[best][:p], total[best][:p], np.asarray(target - whole @ taken)
 
 
 def _in_band(
-    k: Kinematics, y: Vectors, x: Float64[np.ndarray, "n 3 p"]
-) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"]]:
-    """Coefficients with deviations by blocks of two seconds; Huber weights against shocks. The last three are biases."""
+    k: Kinematics, y: Vectors, x: Float64[np.ndarray, "n 3 q"], p: int
+) -> tuple[Float64[np.ndarray, " q"], Float64[np.ndarray, " q"]]:
+    """Coefficients with deviations by blocks of two seconds; Huber weights against shocks. From p on they are small."""
     A, target = k.shown(x), k.shown(y)
     size = np.sqrt((A**2).sum(axis=(0, 1)))
     size[size < 1e-9 * size.max()] = np.inf
     A = A / size
-    weight, p = np.ones(len(y)), x.shape[2]
-    ridge = np.diag([1e-9] * (p - 3) + [BIAS_RIDGE] * 3)
+    weight, q = np.ones(len(y)), x.shape[2]
+    ridge = np.diag([1e-9] * p + [RIDGE] * (q - p))
+    small, alike = np.arange(p + 3, q), max(0.5 / (k.band_hz * k.period_s), 1.0)  # samples, of which one is independent
     for _ in range(3):
-        H = np.einsum("n,nap,naq->pq", weight, A, A) + ridge
+        H = (A * weight[:, None, None]).reshape(-1, q).T @ A.reshape(-1, q) + ridge
         theta = np.linalg.solve(H, np.einsum("n,nap,na->p", weight, A, target))
         left = target - A @ theta
         length = np.sqrt((left**2).sum(axis=1))
         weight = 1.0 / np.maximum(1.0, length / max(3.0 * float(np.median(length)), 1e-12))
-    block = np.floor(k.t_s / BLOCK_S).astype(int)
-    scores = np.zeros((int(block.max()) + 1, p))
-    np.add.at(scores, block, np.einsum("n,nap,na->np", weight, A, left))
-    half = np.linalg.solve(H, scores.T)
-    std = np.sqrt((half**2).sum(axis=1) * len(scores) / max(len(scores) - 2, 1)) / size
+        variance = alike * float((weight * length**2).sum()) / (3.0 * float(weight.sum()))
+        ridge[small, small] = RIDGE + variance / (SMALL * size[small]) ** 2
+    half = np.linalg.solve(H, by_block(k, np.einsum("n,nap,na->np", weight, A, left)).T)
+    std = of_sum(half) / size
     std[~np.isfinite(size)] = np.inf
     return theta / size, std
+
+
+def by_block(k: Kinematics, x: Float64[np.ndarray, "n p"]) -> Float64[np.ndarray, "b p"]:
+    """Sums over blocks of two seconds."""
+    block = np.floor(k.t_s / BLOCK_S).astype(int)
+    sums = np.zeros((int(block.max()) + 1, x.shape[1]))
+    np.add.at(sums, block, x)
+    return sums
+
+
+def of_sum(blocks: Float64[np.ndarray, "p b"]) -> Float64[np.ndarray, " p"]:
+    """Deviation of a sum over blocks, which as in a first-order autoregression may be alike."""
+    square, n = (blocks**2).sum(axis=1), blocks.shape[1]
+    alike = np.clip((blocks[:, 1:] * blocks[:, :-1]).sum(axis=1) / np.maximum(square, 1e-300), 0.0, MOST_ALIKE)
+    return np.asarray(np.sqrt(square * (1.0 + alike) / (1.0 - alike) * n / max(n - 2, 1)))

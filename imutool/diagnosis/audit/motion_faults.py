@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imutool.diagnosis.audit.axes import is_signed
+from imutool.diagnosis.audit.axes import LEAST_TURN, is_signed, nearest_signed
 from imutool.diagnosis.audit.faults import FaultFound, found
-from imutool.diagnosis.audit.motion import BLOCK_S, KinematicFit, Kinematics
+from imutool.diagnosis.audit.motion import KinematicFit, Kinematics, by_block, of_sum
 from imutool.diagnosis.audit.timing import NEAR, clear, timing_faults, with_unit
 from imutool.diagnosis.result import Estimate
 from imutool.units import AXES, SENSORS, Sensor
@@ -17,6 +17,7 @@ from imutool.units import AXES, SENSORS, Sensor
 LEAST_CLOCK = 0.05  # by which a clock is another: smoothing may take as much of a fast motion
 LEAST_OVER_NOISE = 3.0  # deviations of noise
 LEAST_ARM_M = 5e-3
+GRAVITY = {0: "coordinate_acceleration", 2: "gravity_doubled", -1: "gravity_sign"}
 
 
 def motion_faults(k: Kinematics, fit: KinematicFit, filters: tuple[float, float] = (0.0, 0.0)) -> list[FaultFound]:
@@ -52,7 +53,8 @@ def unexplained(k: Kinematics, fit: KinematicFit, faults: Sequence[FaultFound]) 
 
 def _clock_faults(estimates: Mapping[str, Estimate]) -> list[FaultFound]:
     s, m, k = (estimates[name] for name in ("scale", "m", "k"))
-    alike = abs(m.value - s.value**2) < NEAR * abs(s.value**2 - 1.0) and abs(k.value - 1.0) < LEAST_CLOCK
+    whole = min(abs(k.value - times) for times in (1, *GRAVITY)) < LEAST_CLOCK
+    alike = abs(m.value - s.value**2) < NEAR * abs(s.value**2 - 1.0) and whole
     other = abs(s.value - 1.0) > LEAST_CLOCK and clear(s, 1.0) and clear(m, 1.0)
     return [found("other_clock", "both", s=s)] if alike and other else []
 
@@ -66,31 +68,34 @@ def _arm_faults(estimates: Mapping[str, Estimate]) -> list[FaultFound]:
 def _frame_faults(k: Kinematics, fit: KinematicFit) -> list[FaultFound]:
     flipped = any(np.linalg.det(P) < 0.0 for P in fit.axes)
     signed = [is_signed(P) for P in fit.axes]
-    other = [not np.allclose(P, np.eye(3)) for P in fit.axes]
+    other = [np.linalg.det(P) < 0.0 or (s and not np.allclose(P, np.eye(3))) for P, s in zip(fit.axes, signed, strict=True)]
     flags = {
         "world_frame": [frame == "world" for frame in fit.frames],
         "euler_rates": [frame == "euler" for frame in fit.frames],
-        "left_handed" if flipped else "permuted_axes": [s and o for s, o in zip(signed, other, strict=True)],
+        "left_handed" if flipped else "permuted_axes": other,
     }
     out = [found(fault, signal) for fault, each in flags.items() for signal in _which(each)]
-    turned = [sensor for sensor, s in zip(SENSORS, signed, strict=True) if not s]
-    return out + [found("turned_axes", sensor, **_turn(k, fit, sensor)) for sensor in turned]
+    turns = {sensor: _turn(k, fit, sensor) for sensor, s in zip(SENSORS, signed, strict=True) if not s}
+    least = LEAST_TURN / np.sqrt(3.0)  # about one of the axes
+    certain = [s for s, turn in turns.items() if any(clear(angle) and abs(angle.value) > least for angle in turn.values())]
+    return out + [found("turned_axes", sensor, **turns[sensor]) for sensor in certain]
 
 
 def _turn(k: Kinematics, fit: KinematicFit, sensor: Sensor) -> dict[str, Estimate]:
-    """Rotation of the body's axes to the sensor's, with a deviation by blocks of what it leaves."""
-    accel = sensor == "accel"
-    left, samples = fit.residual[:, 3 * accel : 3 * accel + 3], k.accel if accel else k.gyro - k.gyro.mean(axis=0)
-    std = float(np.sqrt((k.shown(left) ** 2).sum() / (samples**2).sum() / max(k.t_s[-1] / BLOCK_S, 1.0)))
-    turn = Rotation.from_matrix(fit.axes[accel]).as_rotvec()
-    return {axis: Estimate(float(angle), std, "rad") for axis, angle in zip(AXES, turn, strict=True)}
+    """Rotation of the body's axes to the sensor's, with a deviation by blocks of what it leaves; of a flipped body's axes."""
+    accel = int(sensor == "accel")
+    P, left = fit.axes[accel], k.shown(fit.residual[:, 3 * accel : 3 * accel + 3])
+    x = (k.accel if accel else k.gyro - k.gyro.mean(axis=0)) @ P
+    H = (x**2).sum() * np.eye(3) - x.T @ x
+    std = of_sum(np.linalg.pinv(H) @ by_block(k, np.cross(x, left)).T)
+    turn = Rotation.from_matrix(P if np.linalg.det(P) > 0.0 else P @ nearest_signed(P).T).as_rotvec()
+    return {axis: Estimate(float(angle), float(s), "rad") for axis, angle, s in zip(AXES, turn, std, strict=True)}
 
 
 def _force_faults(fit: KinematicFit) -> list[FaultFound]:
     m, k, c = (fit.estimates[name] for name in ("m", "k", "c"))
     out = []
-    gravity = {0: "coordinate_acceleration", 2: "gravity_doubled", -1: "gravity_sign"}
-    for whole, name in gravity.items():
+    for whole, name in GRAVITY.items():
         if abs(k.value - whole) < NEAR and clear(k, 1.0):
             out.append(found(name, "accel", gravity=k))
     if abs(m.value) < NEAR and clear(m, 1.0) and abs(k.value - 1.0) < NEAR:

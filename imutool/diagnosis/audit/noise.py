@@ -39,6 +39,7 @@ LEAST_LSB = 0.3  # of the noise: finer digits leave no trace
 SEGMENT, SHORT = 1024, (32, 16)  # samples
 QUARTILE = 0.674  # of a normal distribution, in deviations
 REPEATED = 0.08  # of the samples
+ONE_DIGIT = 1.5  # LSB
 REST = 20  # equal samples in a row
 WALK_PARTS, WALK_P_VALUE = 512, 1e-4  # cosines over a log
 WALK_SHARES, WALKS = np.geomspace(0.03, 1.0, 8), 2.0  # of the expected walk; log likelihood from which one is seen
@@ -225,6 +226,8 @@ def _repeated(samples: Six) -> Iterator[FaultFound]:
     for start, end in true_ranges(equal):
         if end - start >= REST:
             equal[start:end] = False
-    share = float(equal.mean())
-    if share > REPEATED and np.ptp(samples, axis=0).max() > 0.0:
+    share, lsb = float(equal.mean()), np.array([grid(column) for column in samples.T])
+    moves = np.abs(np.diff(samples, axis=0))
+    moves = moves[moves.any(axis=1)]
+    if share > REPEATED and (np.median(moves, axis=0) > ONE_DIGIT * lsb).any():  # slower motion stays for some samples
         yield found("repeated_samples", "both", share=Estimate(share, 0.0, "-"))

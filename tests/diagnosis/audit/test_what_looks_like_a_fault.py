@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt, sosfilt_zi
+from scipy.spatial.transform import Rotation
 from support.benchmarks import benchmark
 
 from imutool.config import build
 from imutool.diagnosis.audit import audit, lines, simulator_faults
+from imutool.diagnosis.audit.axes import Matrix
 from imutool.diagnosis.audit.bandwidth import most_filter_delay
 from imutool.diagnosis.audit.motion import kinematic_fit, kinematics
 from imutool.diagnosis.audit.noise import Expected, fast_noise, noise_faults
@@ -177,3 +179,57 @@ def test_motion_that_is_not_that_of_the_poses_is_told(sensor: str, tmp_path: Pat
     report = audit(tmp_path / "sim.mcap")
     assert (report.faults, list(report.unexplained)) == ((), [sensor])
     assert any(f"the motion that the {sensor} reads differs by" in line for line in lines(report))
+
+
+TURN = Rotation.from_rotvec([0.15, -0.1, 0.2]).as_matrix()
+
+
+@pytest.mark.parametrize(
+    ("scale", "gravity", "axes", "expected"),
+    [
+        (1.3, 1.0, TURN, {("other_clock", "both"), ("turned_axes", "gyro"), ("turned_axes", "accel")}),
+        (1.0, -1.0, TURN, {("gravity_sign", "accel"), ("turned_axes", "gyro"), ("turned_axes", "accel")}),
+        (1.3, 2.0, np.eye(3), {("other_clock", "both"), ("gravity_doubled", "accel")}),
+        (
+            1.0,
+            1.0,
+            TURN @ np.diag([1.0, -1.0, 1.0]),
+            {("left_handed", "both"), ("turned_axes", "gyro"), ("turned_axes", "accel")},
+        ),
+    ],
+)
+def test_two_faults_of_axes_clock_and_gravity_are_both_named(
+    scale: float, gravity: float, axes: Matrix, expected: set[tuple[str, str]]
+) -> None:
+    motion, t = bench.Motion.drawn(np.random.default_rng(5)), np.arange(3200) / 200.0
+    force = scale**2 * motion.force(t, 0.0) + motion.force(t, gravity) - motion.force(t, 0.0)
+    samples = np.concatenate([scale * motion.rate(t) @ axes.T, force @ axes.T], axis=1)
+    faults = simulator_faults(bench._log(motion, t, samples), None, Noise())
+    assert {(fault.fault, fault.signal) for fault in faults} == expected
+    turns = [[fault.parameters[axis].value for axis in "xyz"] for fault in faults if fault.fault == "turned_axes"]
+    assert turns == [pytest.approx([0.15, -0.1, 0.2], abs=0.01)] * len(turns)
+
+
+@pytest.mark.parametrize(("seed", "turns", "moves"), [(7, 1.0, 0.02), (6, 1.0, 0.02), (6, 0.3, 0.05)])
+def test_misalignment_is_no_lever_arm_and_a_planar_motion_shows_no_turn(seed: int, turns: float, moves: float) -> None:
+    rng, t = np.random.default_rng(seed), np.arange(3200) / 100.0
+    motion = bench.Motion.drawn(rng)
+    motion.angles[0] *= 0.3
+    motion.angles[1] *= turns
+    motion.p[0] *= moves
+    small = Rotation.from_rotvec([0.02, 0.025, -0.02]).as_matrix() @ np.diag([1.02, 0.98, 1.01])
+    noise = np.repeat([1e-3, 1e-2], 3) * rng.normal(size=(len(t), 6))
+    samples = np.concatenate([motion.rate(t), motion.force(t) @ small.T], axis=1) + noise
+    assert simulator_faults(bench._log(motion, t, samples), None, Noise()) == []
+    motion.angles[0, 1:] = motion.p[0, 2] = 0.0
+    gyro = motion.rate(t) @ Rotation.from_rotvec([0.02, 0.025, 0.0]).as_matrix().T
+    sim = bench._log(motion, t, np.concatenate([gyro, motion.force(t)], axis=1))
+    assert simulator_faults(sim, None, Noise()) == []
+
+
+def test_digits_of_a_slow_motion_repeat_no_samples() -> None:
+    t = np.arange(6000) / 200.0
+    slow = np.sin(0.3 * t)[:, None] * np.ones(6)
+    x = 5e-3 * np.round(slow / 5e-3)
+    imu = Imu((t * 1e9).astype(np.int64), np.ascontiguousarray(x[:, :3]), np.ascontiguousarray(x[:, 3:]))
+    assert noise_faults(imu, x - slow, []) == ([], [])
