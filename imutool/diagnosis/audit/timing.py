@@ -36,7 +36,8 @@ def timing_faults(estimates: Mapping[str, Estimate], period_s: float, filters: t
     if abs(attitude.value) >= LEAST_DELAY * period_s and clear(attitude) and _is_late_alike(accel, attitude):
         whole = together = True
         name = "step_delay" if attitude.value > 0.0 else "early_stamps"
-        steps |= {signal: name for signal, tau in (("gyro", gyro), ("accel", accel)) if _is_late_alike(tau, attitude)}
+        late_alike = {"accel": accel, **({"gyro": gyro} if clear(gyro) else {})}
+        steps |= {signal: name for signal, tau in late_alike.items() if _is_late_alike(tau, attitude)}
     after_gyro = Estimate(accel.value - gyro.value, float(np.hypot(accel.std, gyro.std)), "-")
     explained = abs(gyro.value) < PART * period_s and abs(after_gyro.value) < PART * period_s  # it makes no whole step
     if explained and (steps["gyro"] != steps["accel"] or not steps["accel"]) and not whole:
