@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from imutool.cli.demo import made_up
 from imutool.config import load
 from imutool.evaluation import evaluate
 from imutool.mcap_io.write import write
+from imutool.recording import Scalars
 from imutool.training.calibration.effect_selection import DRIFTS
 from imutool.training.log_signals import loaded_signals
 from imutool.training.run import train
@@ -117,3 +119,16 @@ def test_a_bias_follows_the_temperature_of_its_log(tmp_path: Path, one_start: No
     models = ["static", *(str(tmp_path / f"{method}.safetensors") for method in ("hybrid", "neural_ode"))]
     _, static, *learnt = (result["aoe_deg"] for result in evaluate(test, models=models, init="truth"))
     assert BETTER * max(learnt) < static
+
+
+def test_a_temperature_that_explains_a_warm_up_takes_the_place_of_the_time(tmp_path: Path) -> None:
+    """Logs that all warm up alike do not tell a drift of the time, or of the motion, from one of the temperature."""
+    recordings = [log(seed, Drifting(kind="warm_up", rate_hz=50.0, lag_s=LAG_S), 40.0) for seed in range(3)]
+    paths = [tmp_path / f"{recording.name}.mcap" for recording in recordings]
+    for path, recording in zip(paths, recordings, strict=True):
+        t_ns = recording.imu.t_ns[::50]
+        warm = 37.0 - 12.0 * np.exp(-1e-9 * (t_ns - t_ns[0]) / LAG_S)
+        write(replace(recording, scalars={TEMPERATURE: Scalars(t_ns, warm[:, None], "degC")}), path)
+    model = trained(tmp_path, paths, "hybrid", *ALONE)
+    assert isinstance(model.config, Config)
+    assert {"gyro_temperature"} == {*DRIFTS} & {*(model.config.gyro_effects or ())}

@@ -33,7 +33,7 @@ from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import Load, Signals
 from imutool.training.calibration.log_scatter import LEAST_GAIN, widest
-from imutool.training.calibration.normal_equations import Seen, Terms, linearise
+from imutool.training.calibration.normal_equations import FOLDS, Seen, Terms, folded, linearise
 from imutool.training.calibration.shared_parameters import Problem, gain_of
 from imutool.training.fit import Epoch, note
 from imutool.training.log_signals import effects_turned_alike, loaded_signals, signals_of
@@ -45,7 +45,6 @@ BY_CHANCE = 0.01  # probability of finding any effect where there is none
 DRIFTS = dict.fromkeys(("gyro_warm_up", "gyro_rate_load", "gyro_force_load", *temperature.EFFECTS), 0.3)  # they look alike
 LINEAR: Mapping[Sensor, tuple[str, ...]] = {sensor: (f"{sensor}_misalignment", f"{sensor}_scale") for sensor in SENSORS}
 CONTAINED = {"rate_curve": "gyro_scale"}  # a curve imitates a scale, which then needs evidence as any other effect
-FOLDS = 3  # parts of a log where there are fewer logs than this
 UNSEEN = 0.9  # of its prior's width: a parameter no narrower was not seen
 
 
@@ -125,19 +124,6 @@ def calibrate(
     )
 
 
-def folded(pool: Pool) -> Pool:
-    """Pool with the training part of each log cut in folds where logs are few."""
-    if len(pool.names) >= FOLDS:
-        return pool
-    counts = ~pool.held_out
-    length = torch.bincount(pool.log, weights=counts.to(pool.t)).long()
-    before = torch.cumsum(length, 0) - length
-    index = (torch.cumsum(counts, 0) - 1 - before[pool.log]).clamp(min=0)  # within the part; the others are not used
-    log = pool.log * FOLDS + (index * FOLDS // length.clamp(min=1)[pool.log]).clamp(max=FOLDS - 1)
-    names = tuple(f"{n} {k + 1}/{FOLDS}" for n in pool.names for k in range(FOLDS))
-    return replace(pool, names=names, log=log, floors=pool.floors.repeat_interleave(FOLDS, dim=0))
-
-
 def parameter_columns(effects: Sequence[LinearForm], names: Sequence[str]) -> list[int]:
     """Columns of the parameters of some effects."""
     chosen = [effect.name in names for effect in effects for _ in effect.parameters]
@@ -166,7 +152,25 @@ def effects_beyond_chance(problem: Problem, effects: Sequence[LinearForm]) -> di
     for name in (form.name for form in effects if form.name in LINEAR[form.sensor] and form.name not in {*gains, *imitated}):
         new = problem.predicted(parameter_columns(effects, [*gains, name]))
         gains[name], loss = gain_of(new, loss), new
-    return gains
+    return _likelier_drifts(problem, effects, gains)
+
+
+def _likelier_drifts(problem: Problem, effects: Sequence[LinearForm], gains: Mapping[str, float]) -> dict[str, float]:
+    """Gains with each drift in the place of one that predicts other logs worse, now that all other effects are known.
+
+    Time and motion stand in for a temperature: one that the logs record takes their place unless it predicts worse.
+    """
+    chosen = dict(gains)
+    for drift in [name for name in gains if name in DRIFTS]:
+        kept = {name: gain for name, gain in gains.items() if name != drift}
+        alone, loss = (problem.predicted(parameter_columns(effects, [*names])) for names in (kept, chosen))
+        for name in (effect.name for effect in effects if effect.name in DRIFTS and effect.name not in gains):
+            new = problem.predicted(parameter_columns(effects, [*kept, name]))
+            least, most = (-LEAST_GAIN, 0.0) if name in temperature.EFFECTS else (LEAST_GAIN, 0.5 * len(loss))
+            better = gain_of(new, loss) >= least and bool((new < loss).sum() > most)
+            if better and gain_of(new, alone) >= DRIFTS[name] and _beyond_chance(problem, effects, [*kept, name]):
+                chosen, loss = kept | {name: gain_of(new, alone)}, new
+    return chosen
 
 
 def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Sequence[str]) -> bool:

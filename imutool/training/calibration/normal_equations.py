@@ -10,6 +10,7 @@ matrices.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +39,20 @@ REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of m
 SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
 SETTLED, MOST_STEPS = 0.2, 40  # deviations by which a step moves a parameter at most; steps with windows of all lengths
 WEAK = 0.01  # of a prior's precision, that of the prior at first
+FOLDS = 3  # parts of a log where there are fewer logs than this
+
+
+def folded(pool: Pool) -> Pool:
+    """Pool with the training part of each log cut in folds where logs are few."""
+    if len(pool.names) >= FOLDS:
+        return pool
+    counts = ~pool.held_out
+    length = torch.bincount(pool.log, weights=counts.to(pool.t)).long()
+    before = torch.cumsum(length, 0) - length
+    index = (torch.cumsum(counts, 0) - 1 - before[pool.log]).clamp(min=0)  # within the part; the others are not used
+    log = pool.log * FOLDS + (index * FOLDS // length.clamp(min=1)[pool.log]).clamp(max=FOLDS - 1)
+    names = tuple(f"{n} {k + 1}/{FOLDS}" for n in pool.names for k in range(FOLDS))
+    return replace(pool, names=names, log=log, floors=pool.floors.repeat_interleave(FOLDS, dim=0))
 
 
 def design_effect(pool: Pool) -> float:

@@ -15,8 +15,8 @@ from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm, compiled
 from imutool.sensor.signals import SignalFilter
-from imutool.training.calibration.effect_selection import FOLDS, LINEAR, Calibration, calibrate, folded
-from imutool.training.calibration.normal_equations import design_effect
+from imutool.training.calibration.effect_selection import LINEAR, Calibration, calibrate
+from imutool.training.calibration.normal_equations import FOLDS, design_effect, folded
 from imutool.training.candidates import CANDIDATES, best_predicted
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Pool
