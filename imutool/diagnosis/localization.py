@@ -168,12 +168,15 @@ def locate(
 
 
 def _without_bias(scaled: Samples) -> Samples:
-    """Misfit over noise without a constant, which the bias takes: that of samples which are alike, as before it sets in."""
+    """Misfit over noise without a constant, which the bias takes: that of most samples which are alike, or the median.
+
+    What sets in leaves the samples before it alike; behind a step of a bias they are alike, too, and the longer part counts.
+    """
     out = scaled - np.median(scaled, axis=0)
     for k in range(out.shape[1]):
         _, first, counts = np.unique(np.rint(out[:, k] / ALIKE), return_index=True, return_counts=True)
-        often = first[counts > NONE * len(out)]  # behind a step of a bias all are alike, too
-        out[:, k] -= out[often.min(), k] if len(often) else 0.0
+        most = int(counts.argmax())
+        out[:, k] -= out[first[most], k] if counts[most] > NONE * len(out) else 0.0
     return np.where(np.abs(out) < 2.0 * ALIKE, 0.0, out)
 
 
