@@ -17,7 +17,8 @@ from imutool.array_types import Float64
 CLEARLY = 0.5  # of the squares of the ideal sensor, up to which another unit, frame or axes are chosen
 ALIKE = 1.1  # times the least squares: hypotheses that explain as much, of which the simplest is taken
 LEAST_TURN = 0.05  # rad, from signed axes: less is a mount's misalignment
-UNSEEN = 1e-4  # of the products of signal and parts: less tells no rotation, as that about the only axis of a planar motion
+UNSEEN = 1e-4  # of the products of signal and parts: less tells no rotation, as that about the only axis of a planar motion;
+# so rotations come out too small by up to this share
 LEAST_SEEN = 0.01  # of these products, of the axis that moves least beside a turned reflection
 MOST_BIAS = 1.0  # m/s², of the accelerometer: gravity in the world frame is none
 
@@ -65,9 +66,11 @@ class Hypotheses:
         The motion may be `scaled`, as that of another clock is.
         """
         out: list[tuple[float, int, str, Matrix]] = []
-        frames = list(self.frames.items())
-        for turned, (frame, x) in [(False, each) for each in frames] + [(True, each) for each in frames[: self.turns]]:
-            axes = self._turned(y, x) if turned else PERMUTATIONS
+        tried = [(frame, x, PERMUTATIONS) for frame, x in self.frames.items()]
+        if self.turns:
+            right, x = next(iter(self.frames.items()))
+            tried.append((right, x, self._turned(y, x)))
+        for frame, x, axes in tried:
             each = zip(axes, _least(y, x, axes, free_bias=self.free_bias, scaled=scaled), strict=True)
             out += [(left, len(out) + rank, frame, P) for rank, (P, left) in enumerate(each)]
         return out

@@ -47,7 +47,7 @@ def most_filter_delays(sim: Recording, fit: KinematicFit) -> tuple[float, float]
 def _is_mean(
     left: Float64[np.ndarray, "n 3"], rate: Float64[np.ndarray, "n 3"], t_s: Float64[np.ndarray, " n"], late_s: float
 ) -> bool:
-    """Whether a mean of the rate over twice its delay leaves this of a fitted scale and delay: tau^2 / 6 of its curvature."""
+    """Whether a residual is what a mean of the rate over twice its delay leaves: tau^2 / 6 of the rate's curvature."""
     rate = rate - rate.mean(axis=0)
     bent = np.gradient(np.gradient(rate, t_s, axis=0), t_s, axis=0)
     left, bent = (x - x.mean(axis=0) - rate * (x * rate).sum() / (rate**2).sum() for x in (left, bent))

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imutool.diagnosis.audit.axes import LEAST_TURN, is_signed, nearest_signed
+from imutool.diagnosis.audit.axes import LEAST_TURN, UNSEEN, is_signed, nearest_signed
 from imutool.diagnosis.audit.faults import FaultFound, found
 from imutool.diagnosis.audit.motion import KinematicFit, Kinematics, by_block, of_sum
 from imutool.diagnosis.audit.timing import NEAR, clear, timing_faults, with_unit
@@ -82,13 +82,14 @@ def _frame_faults(k: Kinematics, fit: KinematicFit) -> list[FaultFound]:
 
 
 def _turn(k: Kinematics, fit: KinematicFit, sensor: Sensor) -> dict[str, Estimate]:
-    """Rotation of the body's axes to the sensor's, with a deviation by blocks of what it leaves; of a flipped body's axes."""
+    """Rotation of the body's axes, or of the nearest flipped ones, to the sensor's, with a deviation by blocks."""
     accel = int(sensor == "accel")
     P, left = fit.axes[accel], k.shown(fit.residual[:, 3 * accel : 3 * accel + 3])
     x = (k.accel if accel else k.gyro - k.gyro.mean(axis=0)) @ P
-    H = (x**2).sum() * np.eye(3) - x.T @ x
-    std = of_sum(np.linalg.pinv(H) @ by_block(k, np.cross(x, left)).T)
+    spread = np.linalg.pinv((x**2).sum() * np.eye(3) - x.T @ x)
     turn = Rotation.from_matrix(P if np.linalg.det(P) > 0.0 else P @ nearest_signed(P).T).as_rotvec()
+    towards_none = UNSEEN * np.linalg.norm(x.T @ x) * np.abs(spread) @ np.abs(turn)
+    std = np.hypot(of_sum(spread @ by_block(k, np.cross(x, left)).T), towards_none)
     return {axis: Estimate(float(angle), float(s), "rad") for axis, angle, s in zip(AXES, turn, std, strict=True)}
 
 

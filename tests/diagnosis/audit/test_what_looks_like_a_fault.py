@@ -181,7 +181,8 @@ def test_motion_that_is_not_that_of_the_poses_is_told(sensor: str, tmp_path: Pat
     assert any(f"the motion that the {sensor} reads differs by" in line for line in lines(report))
 
 
-TURN = Rotation.from_rotvec([0.15, -0.1, 0.2]).as_matrix()
+TURN_RAD = (0.15, -0.1, 0.2)
+TURN = Rotation.from_rotvec(TURN_RAD).as_matrix()
 
 
 @pytest.mark.parametrize(
@@ -207,7 +208,16 @@ def test_two_faults_of_axes_clock_and_gravity_are_both_named(
     faults = simulator_faults(bench._log(motion, t, samples), None, Noise())
     assert {(fault.fault, fault.signal) for fault in faults} == expected
     turns = [[fault.parameters[axis].value for axis in "xyz"] for fault in faults if fault.fault == "turned_axes"]
-    assert turns == [pytest.approx([0.15, -0.1, 0.2], abs=0.01)] * len(turns)
+    assert turns == [pytest.approx(TURN_RAD, abs=0.01)] * len(turns)
+
+
+def test_the_deviation_of_a_turn_knows_what_holds_it_back() -> None:
+    """Without noise it was a thousandth of the error."""
+    motion, t = bench.Motion.drawn(np.random.default_rng(5)), np.arange(3200) / 200.0
+    samples = np.concatenate([motion.rate(t) @ TURN.T, motion.force(t) @ TURN.T], axis=1)
+    for fault in simulator_faults(bench._log(motion, t, samples), None, Noise()):
+        off = [abs(fault.parameters[a].value - true) / fault.parameters[a].std for a, true in zip("xyz", TURN_RAD, strict=True)]
+        assert max(off) < 4.0
 
 
 @pytest.mark.parametrize(("seed", "turns", "moves"), [(7, 1.0, 0.02), (6, 1.0, 0.02), (6, 0.3, 0.05)])
