@@ -70,7 +70,7 @@ def _listing(path: Path, mtime_ns: int, size: int) -> Listing:  # the key notice
 def _list_zip(path: Path) -> Listing:
     listing = Listing()
     with refusing(path), zipfile.ZipFile(path) as archive:
-        total, most = 0, MAX_RATIO * path.stat().st_size + RATIO_FREE
+        total, maximum = 0, MAX_RATIO * path.stat().st_size + RATIO_FREE
         for number, info in enumerate(archive.infolist()):
             name = _checked_name(path, info.filename, number)
             if not info.filename or not name.isprintable():  # such as a Mac's "Icon\r": nothing that is read has such a name
@@ -92,8 +92,8 @@ def _list_zip(path: Path) -> Listing:
                         expected=f"at most {MAX_RATIO} to 1",
                     )
                 total += info.file_size
-                if total > most:  # members may share their bytes, each of them within its own bound
-                    raise DataError(f"unpacks to more than {most} bytes", where=path, expected=f"at most {MAX_RATIO} to 1")
+                if total > maximum:  # members may share their bytes, each of them within its own bound
+                    raise DataError(f"unpacks to more than {maximum} bytes", where=path, expected=f"at most {MAX_RATIO} to 1")
     return listing
 
 

@@ -203,8 +203,8 @@ def _from_text(form: _Format, rows: list[list[str]]) -> np.ndarray:
     for label, letter, texts in zip(form.labels, form.letters, zip(*rows, strict=True), strict=True):
         kind = found.dtype[label]
         if letter in TEXT_SCALES:
-            scaled, held = np.rint(np.array(texts, float) * TEXT_SCALES[letter]), np.iinfo(kind)
-            if not ((scaled >= held.min) & (scaled <= held.max)).all():
+            scaled, limits = np.rint(np.array(texts, float) * TEXT_SCALES[letter]), np.iinfo(kind)
+            if not ((scaled >= limits.min) & (scaled <= limits.max)).all():
                 raise ValueError(f"a {label} is beyond what the binary log holds")
             found[label] = scaled.astype(kind)
         elif kind.kind == "S":

@@ -21,7 +21,7 @@ from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import Remarks, Table
 from imutool.recording.sample_order import in_order
 
-LEAST_IMU_HZ = 10.0  # slower logs of a sensor are samples for its temperature, not for its motion
+MIN_IMU_HZ = 10.0  # slower logs of a sensor are samples for its temperature, not for its motion
 FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
 UP_FROM_DOWN = np.array([1.0, 1.0, -1.0])
 Q_ENU_FROM_NED_WXYZ = np.array([[0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0]])
@@ -87,7 +87,7 @@ def _combined(columns: Columns) -> tuple[Any, Any, Any, Any]:
 def _pair(gyro: Columns, accel: Columns) -> tuple[Any, Any, Any, Any] | None:
     """Stamps and values of both sensors; None if the gyro is logged too slowly."""
     gyro_ns, rates = _samples(gyro)
-    if len(gyro_ns) < 2 or (len(gyro_ns) - 1) * 1e9 < LEAST_IMU_HZ * float(gyro_ns[-1] - gyro_ns[0]):
+    if len(gyro_ns) < 2 or (len(gyro_ns) - 1) * 1e9 < MIN_IMU_HZ * float(gyro_ns[-1] - gyro_ns[0]):
         return None
     return (gyro_ns, rates, *_samples(accel))
 

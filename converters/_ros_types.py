@@ -141,9 +141,9 @@ class Ros1Types:
         store = self._store_of(definition, ros2_name(kind))
         ros1_kind = _type_name(ros2_name(kind))
         kind = RENAMED.get(ros2_name(kind), ros1_kind)
-        theirs = ros2_store()
+        standard = ros2_store()
         fields = store.fielddefs[ros1_kind][1]
-        if kind in theirs.fielddefs and same_layout(store.fielddefs, ros1_kind, theirs.fielddefs, kind):
+        if kind in standard.fielddefs and same_layout(store.fielddefs, ros1_kind, standard.fielddefs, kind):
             text, digest = ros2_definition(kind) or (b"", "")
         else:
             kind = ros1_kind
@@ -214,23 +214,25 @@ def ros1_topic(name: str, kind: str, definition: str) -> MessageTopic:
     return MessageTopic(name, spelled, "ros1msg", definition.encode(), "ros1")
 
 
-def same_layout(ours: Mapping[str, Any], our_kind: str, theirs: Mapping[str, Any], their_kind: str) -> bool:
+def same_layout(own: Mapping[str, Any], own_kind: str, standard: Mapping[str, Any], standard_kind: str) -> bool:
     """Whether two definitions lay out a message in the same bytes, and name its fields alike."""
-    if our_kind == HEADER == their_kind:
+    if own_kind == HEADER == standard_kind:
         return True
-    if our_kind not in ours or their_kind not in theirs:
+    if own_kind not in own or standard_kind not in standard:
         return False
-    mine, other = ours[our_kind][1], theirs[their_kind][1]
-    if [name for name, _ in mine] != [name for name, _ in other]:
+    own_fields, their_fields = own[own_kind][1], standard[standard_kind][1]
+    if [name for name, _ in own_fields] != [name for name, _ in their_fields]:
         return False
-    return all(_same_field(ours, a, theirs, b) for (_, a), (_, b) in zip(mine, other, strict=True))
+    return all(_same_field(own, a, standard, b) for (_, a), (_, b) in zip(own_fields, their_fields, strict=True))
 
 
-def _same_field(ours: Mapping[str, Any], mine: Any, theirs: Mapping[str, Any], other: Any) -> bool:
-    if mine[0] != other[0]:
+def _same_field(own: Mapping[str, Any], own_field: Any, standard: Mapping[str, Any], standard_field: Any) -> bool:
+    if own_field[0] != standard_field[0]:
         return False
-    if mine[0] == NAME:
-        return same_layout(ours, mine[1], theirs, other[1])
-    if isinstance(mine[1][0], tuple):  # an array or a sequence: of what, and how many
-        return bool(mine[1][1] == other[1][1]) and _same_field(ours, mine[1][0], theirs, other[1][0])
-    return bool(mine == other)
+    if own_field[0] == NAME:
+        return same_layout(own, own_field[1], standard, standard_field[1])
+    if isinstance(own_field[1][0], tuple):  # an array or a sequence: of what, and how many
+        return bool(own_field[1][1] == standard_field[1][1]) and _same_field(
+            own, own_field[1][0], standard, standard_field[1][0]
+        )
+    return bool(own_field == standard_field)

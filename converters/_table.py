@@ -177,13 +177,13 @@ def _places(header: list[str], width: int, where: str, kind: str) -> dict[str, l
         templates, axes = SPELLINGS[quantity]
         for template in templates:
             wanted = [template.format(axis) for axis in axes]
-            held = [name for name in wanted if name in names]
-            if len(held) == len(wanted):
+            present = [name for name in wanted if name in names]
+            if len(present) == len(wanted):
                 places[quantity] = [names.index(name) for name in wanted]
                 break
-            if held:
+            if present:
                 missing = next(name for name in wanted if name not in names)
-                raise DataError(f"header has {held[0]!r} but not {missing!r}", where=where, expected=", ".join(wanted))
+                raise DataError(f"header has {present[0]!r} but not {missing!r}", where=where, expected=", ".join(wanted))
     if places:
         return places
     start = 0

@@ -11,7 +11,7 @@ from ._table_map import RATE_TO_STATE, Entries, Proposal, column_named
 from ._table_names import TIME_WORDS, XSENS_TIME, name_and_unit, spaced_name, unit_named
 from ._table_text import Columns
 from ._table_times import (
-    MOST_SKIPPED,
+    MAX_SKIPPED,
     PLAUSIBLE_HZ,
     count_times,
     counters_of,
@@ -29,7 +29,7 @@ from ._table_times import (
 from ._table_units import TIME_NS
 from ._table_wraps import begun_anew
 
-MOST_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
+MAX_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
 SENSOR_TIME = r"(sensor|event|hardware|hw)_?(event_?)?(time|t_|ts|stamp)"  # Android's, beside the time of the program
 OWN_TIME = {"gyro": r"gyro?(scope)?_t", "accel": r"acc(el(eration|erometer)?)?_t"}  # names of a sensor's own stamps begin so
 
@@ -104,7 +104,7 @@ def _count_at(proposal: Proposal, columns: Columns, given: Entries, length: int)
 
 def _shows_losses(counter: np.ndarray) -> bool:
     """Whether the steps of a counter that are longer than the usual one are lost samples, as far as it shows."""
-    return not (len(begun_anew(counter)) or counts_others(counter)) and share_skipped(counter) <= MOST_SKIPPED
+    return not (len(begun_anew(counter)) or counts_others(counter)) and share_skipped(counter) <= MAX_SKIPPED
 
 
 def _unnamed_time(
@@ -202,7 +202,7 @@ def _another_pace(columns: Columns, column: str, unit: str, names: dict[str, tup
         values, stated = columns.values[other], unit_named(columns.units.get(other, "")) or unit_in_name
         if other != column and stated in TIME_NS and len(values) == len(columns.values[column]) and goes_on(values):
             passed = float(values[-1] - values[0]) * TIME_NS[stated]
-            if abs(passed - span) > MOST_APART * passed + WHOLE_NS:
+            if abs(passed - span) > MAX_APART * passed + WHOLE_NS:
                 return f"by {other!r} {passed * 1e-9:.4g} s pass and not {span * 1e-9:.4g} s"
     return ""
 
@@ -215,7 +215,7 @@ def _propose_rate(proposal: Proposal, columns: Columns, counter: str, length: in
     if counter and counts_others(columns.values[counter]):
         used = ""
         counted = f"{counter!r} counts more than the samples ({said_steps(columns.values[counter])}): rows are counted"
-    elif counter and share_skipped(columns.values[counter]) > MOST_SKIPPED:
+    elif counter and share_skipped(columns.values[counter]) > MAX_SKIPPED:
         proposal.open.append("counter")
         proposal.reasons.append(
             f"{said_steps(columns.values[counter])} in {counter!r}: are samples missing, or does it count packets of other"

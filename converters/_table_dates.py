@@ -149,8 +149,8 @@ def said_epoch(t_ns: int, name: str) -> list[str]:
     if t_ns < OLDEST_NS:
         return []
     date, *others = (str(np.datetime64(t_ns + first, "ns"))[:10] for first in (0, *first_ns.values()))
-    said = " and ".join(f"{other} if it counts since {what}" for other, what in zip(others, first_ns, strict=True))
-    return [f"{name!r} begins on {date} if it counts since 1970, as the log has it; on {said}"]
+    readings = " and ".join(f"{other} if it counts since {what}" for other, what in zip(others, first_ns, strict=True))
+    return [f"{name!r} begins on {date} if it counts since 1970, as the log has it; on {readings}"]
 
 
 NUMBERED: tuple[tuple[Callable[[np.ndarray], Int64[np.ndarray, " n"] | None], str], ...] = (  # readers, and what they read

@@ -18,22 +18,22 @@ from ._table_numbers import is_number
 
 BETWEEN = "---"
 FIELD = re.compile(r"(?P<indent> *)(?P<item>- )?((?P<name>[A-Za-z_]\w*):(?!\S))?[ ]*(?P<value>.*)")
-LEAST_MESSAGES, LEAST_NUMBERS = 3, 4  # in a text, and in a message
+MIN_MESSAGES, MIN_NUMBERS = 3, 4  # in a text, and in a message
 LOOKED_AT = 1 << 14  # characters of a text, whose first rows show a long table
-MOST_COMMENTS = 20  # lines above the header of a long table
-LEAST_SIGNALS, MOST_SIGNALS = 6, 60  # of a long table, which is an IMU's
-LEAST_WHOLE = 0.9  # share of its times that have a value of every signal
+MAX_COMMENTS = 20  # lines above the header of a long table
+MIN_SIGNALS, MAX_SIGNALS = 6, 60  # of a long table, which is an IMU's
+MIN_WHOLE = 0.9  # share of its times that have a value of every signal
 
 
 def of_echo(text: str) -> tuple[str, int]:
     """The messages as a table of text, and how many are left out; empty for any other text."""
-    if text.count(f"\n{BETWEEN}") < LEAST_MESSAGES:
+    if text.count(f"\n{BETWEEN}") < MIN_MESSAGES:
         return "", 0
     messages = [dict(_fields(part)) for part in re.split(rf"^{BETWEEN}\s*$", text, flags=re.MULTILINE)]
     messages = [message for message in messages if message]
     names = list(messages[0]) if messages else []
     rows = [[message[name] for name in names] for message in messages if {*message} >= {*names}]
-    if len(names) < LEAST_NUMBERS or len(rows) < LEAST_MESSAGES:
+    if len(names) < MIN_NUMBERS or len(rows) < MIN_MESSAGES:
         return "", 0
     return "\n".join("\t".join(row) for row in [names, *rows]) + "\n", len(messages) - len(rows)
 
@@ -56,7 +56,7 @@ def of_long(text: str) -> tuple[str, int]:
 
     Its signals share their times, and none has two values at one time.
     """
-    first = next((line for line in text.split("\n", MOST_COMMENTS)[:MOST_COMMENTS] if line.strip() and line[0] != "#"), "")
+    first = next((line for line in text.split("\n", MAX_COMMENTS)[:MAX_COMMENTS] if line.strip() and line[0] != "#"), "")
     mark = next((mark for mark in ";\t," if mark in first), "")
     header = next(csv.reader([first], delimiter=mark)) if mark else []
     names = [split_name(name)[0] for name in header]
@@ -69,7 +69,7 @@ def of_long(text: str) -> tuple[str, int]:
     if not all(is_number(row[value]) for row in rows):
         return "", 0
     every = {n: {row[n] for row in rows} for n in range(len(header)) if n not in (time, value)}
-    signal = [n for n, texts in every.items() if 1 < len(texts) <= MOST_SIGNALS and not any(map(is_number, texts))]
+    signal = [n for n, texts in every.items() if 1 < len(texts) <= MAX_SIGNALS and not any(map(is_number, texts))]
     found: dict[str, dict[str, str]] = {}
     for row in rows:
         values, name = found.setdefault(row[time], {}), "_".join(row[n].strip() for n in signal)
@@ -78,7 +78,7 @@ def of_long(text: str) -> tuple[str, int]:
         values[name] = row[value]
     signals = list(dict.fromkeys(name for values in found.values() for name in values))
     whole = {t: values for t, values in found.items() if len(values) == len(signals)}
-    if not LEAST_SIGNALS <= len(signals) <= MOST_SIGNALS or len(whole) < max(LEAST_MESSAGES, LEAST_WHOLE * len(found)):
+    if not MIN_SIGNALS <= len(signals) <= MAX_SIGNALS or len(whole) < max(MIN_MESSAGES, MIN_WHOLE * len(found)):
         return "", 0
     table = [[header[time], *signals], *([t, *(values[name] for name in signals)] for t, values in whole.items())]
     return "\n".join("\t".join(row) for row in table) + "\n", len(found) - len(whole)

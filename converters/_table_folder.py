@@ -38,8 +38,8 @@ from ._table_times import rises
 from .px4_csv import logs_in
 from .sensor_tables import is_phone
 
-MOST_TABLES = 40  # of one recording
-MOST_NAMED = 5  # of tables that are left out
+MAX_TABLES = 40  # of one recording
+MAX_NAMED = 5  # of tables that are left out
 DATA_FILE = "data.hdf5"  # of RoNIN
 logger = logging.getLogger(__package__)  # whose records `_unpacking` renames
 ENDINGS = (
@@ -78,13 +78,13 @@ def sequences_below(source: Path) -> list[Sequence]:
     others = [folder for folder, own in found.items() if sequences and not own and folder not in parts]
     names = ((path.parent, re.sub(SPACED, "_", path.parent.name).lower(), path) for each in others for path in _tables(each))
     if true := [f"{folder.name}/{path.name}" for folder, name, path in names if re.fullmatch(POSES, name)]:
-        said = f"tables of true poses in a folder without an IMU are left out: {_listed(true)}"
-        logger.warning("%s: %s. Put each beside the tables of its IMU, with ground_truth in its name", source, said)
+        note = f"tables of true poses in a folder without an IMU are left out: {_listed(true)}"
+        logger.warning("%s: %s. Put each beside the tables of its IMU, with ground_truth in its name", source, note)
     return sequences
 
 
 def _listed(names: list[str]) -> str:
-    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
+    return ", ".join(names[:MAX_NAMED]) + (f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else "")
 
 
 def _sequences_in(folder: Path) -> list[Sequence]:
@@ -104,9 +104,9 @@ def _sequences_in(folder: Path) -> list[Sequence]:
     shown = (
         kind in ("csv", "") or (kind != "json" and (look(path).header or look(path).has_time)) for path, kind in others.items()
     )
-    left = [path.relative_to(folder).as_posix() for path, is_table in zip(others, shown, strict=True) if is_table]
-    if found and left:  # settings in JSON are none, and damaged ones are told of
-        logger.warning("%s: tables that show no IMU are left out: %s", folder, _listed(left))
+    unread = [path.relative_to(folder).as_posix() for path, is_table in zip(others, shown, strict=True) if is_table]
+    if found and unread:  # settings in JSON are none, and damaged ones are told of
+        logger.warning("%s: tables that show no IMU are left out: %s", folder, _listed(unread))
     places = {name: (next(iter(tables)), "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
     return [Sequence(folder.name if len(found) == 1 else name, *place) for name, place in places.items()]
 
@@ -189,7 +189,7 @@ def _recordings(folder: Path) -> dict[str, Names]:
     stems = _stems(folder)
     roles = {path: f"{path.relative_to(folder).parts[0]}_" if path.parent != folder else "" for path in stems}
     names = {path: roles[path] + stem for path, stem in stems.items()}
-    first = dict(islice(names.items(), MOST_TABLES))
+    first = dict(islice(names.items(), MAX_TABLES))
     if groups := role_groups(names) or role_groups(first):
         parts = recorded_apart(groups, list(names))
         if len(parts) > 1:
@@ -273,7 +273,7 @@ def _load(path: Path) -> Columns:
         return part
     if not _is_narrow(path):
         return load(path, kind_of(head(path), path))
-    read_csv(text_of(read_bytes(path)), part, path, least=3 if is_text_table(head(path), 3) else 1)
+    read_csv(text_of(read_bytes(path)), part, path, minimum=3 if is_text_table(head(path), 3) else 1)
     if not part.values:
         raise DataError("holds no columns of numbers", where=path)
     return part

@@ -45,8 +45,8 @@ def add_local(columns: Columns) -> None:
         values[:, 2] *= POSITION_SI[stated]
         for axis, each in zip(("north", "east", "down"), _plane(values).T, strict=True):
             columns.values[f"{LOCAL}{axis} [m]"] = each
-        said = f"{LOCAL}north, {LOCAL}east and {LOCAL}down are {latitude}, {longitude} and {height} about their first"
-        columns.remarks.notes.append(f"{said}, in m; the angles are taken for {unit}")
+        note = f"{LOCAL}north, {LOCAL}east and {LOCAL}down are {latitude}, {longitude} and {height} about their first"
+        columns.remarks.notes.append(f"{note}, in m; the angles are taken for {unit}")
 
 
 def in_their_world(columns: Columns, entries: Entries, position: list[str], clock: tuple[str, str]) -> tuple[list[str], str]:
@@ -62,8 +62,8 @@ def in_their_world(columns: Columns, entries: Entries, position: list[str], cloc
     if share > UP and name == EASTING:
         return position, ""
     if share > UP and "quaternion_wxyz" in entries:
-        said = "the world of the quaternions has +z up: it counts as east, north, up, and so do the positions"
-        return [position[1], position[0], f"-{position[2]}"], said
+        note = "the world of the quaternions has +z up: it counts as east, north, up, and so do the positions"
+        return [position[1], position[0], f"-{position[2]}"], note
     if share < -UP and name != EASTING:
         return position, ""
     what = "has +z up" if share > UP else "has +z down" if share < -UP else "does not show which way is up"

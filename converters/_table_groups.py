@@ -32,9 +32,9 @@ from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 
 Axes = dict[str, str]  # columns by x, y, z
 CALIBRATED = r"(?i)\bcalibrated\b"  # in the name of a group, beside one of raw counts
-MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
-LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
-MOST_LONGER = 10.0  # is a span of time than another in the same unit
+MAX_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
+MIN_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
+MAX_LONGER = 10.0  # is a span of time than another in the same unit
 TRUE_GROUPS = (
     r"(data_?)?(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)(_?data)?\d*"
 )
@@ -49,15 +49,15 @@ def imus_apart(columns: Columns) -> dict[str, Columns]:
     paired = _paired(gyros, accels) if len(gyros) > 1 else {}
     of = {owner: {*gyros[owner].values(), *chain(*(accel.values() for accel in each))} for owner, each in paired.items()}
     groups = {owner: group_of(gyros[owner]["x"]) for owner in of}
-    apart = {}
+    separate = {}
     for owner, own in of.items():
         others = {group for group in groups.values() if group and group != groups[owner]}
         beside = {c for c in columns.values if group_of(c) in others and not is_time(c)}  # an orientation of theirs
         taken = set().union(*of.values(), beside, _raw_counts(columns)) - own
         values = {c: v for c, v in columns.values.items() if c not in taken}
         named = owner if owner[:1].isalpha() else f"imu_{owner}"  # a part of a ROS topic begins with a letter
-        apart[f"/{named}/imu" if owner else IMU_TOPIC] = replace(columns, values=values)
-    return apart
+        separate[f"/{named}/imu" if owner else IMU_TOPIC] = replace(columns, values=values)
+    return separate
 
 
 def _paired(gyros: Mapping[str, Axes], accels: Mapping[str, Axes]) -> dict[str, list[Axes]]:
@@ -84,8 +84,8 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     that of a motion capture.
     """
     time, unit = str(entries["time"]), str(entries["time_unit"])
-    other = time_beside(columns, columns.unsigned(entries["accel"][0]), time, unit, apart=True)
-    own = time_beside(columns, columns.unsigned(entries["gyro"][0]), time, unit, apart=True)
+    other = time_beside(columns, columns.unsigned(entries["accel"][0]), time, unit, separate=True)
+    own = time_beside(columns, columns.unsigned(entries["gyro"][0]), time, unit, separate=True)
     found: Entries = {"accel_time": other[0]} if other is not None and other[1] == unit and other != own else {}
     found |= _position_beside(columns, entries)
     poses = []
@@ -123,7 +123,7 @@ def _bodies(columns: Columns, time: str, unit: str) -> Iterator[tuple[tuple[str,
     groups: dict[tuple[tuple[str, str], bool], dict[str, dict[str, str]]] = {}
     for column, (owner, leaf) in pose_leaves(columns.values).items():
         in_rows = (time, unit) if len(columns.values[column]) == len(columns.values[time]) else None
-        beside = time_beside(columns, column, time, unit, apart=True) or in_rows
+        beside = time_beside(columns, column, time, unit, separate=True) or in_rows
         if beside is not None:
             name = re.sub(rf"^{TRUE_GROUPS}_", "", leaf)
             groups.setdefault((beside, is_true(column) or name != leaf), {}).setdefault(owner, {})[name] = column
@@ -136,7 +136,7 @@ def _own_time(columns: Columns, leaves: dict[str, str], time: str, unit: str) ->
     """Time of true poses among the columns of the IMU's table, as `truth_t`, and its unit."""
     own = (c for leaf, c in leaves.items() if c != time and re.fullmatch(TIME_WORDS, leaf) and goes_on(columns.values[c]))
     other = next(own, None)
-    return _with_unit(columns, other, time, unit, apart=True) if other else None
+    return _with_unit(columns, other, time, unit, separate=True) if other else None
 
 
 def turned(columns: Columns, entries: Entries) -> Entries:
@@ -179,7 +179,7 @@ def pose_clock(columns: Columns, entries: Entries) -> Entries:
     for column in names:
         column_named(columns, column, "mapping")
     own = str(entries["time"]), str(entries["time_unit"])
-    time, unit = time_beside(columns, names[0], *own, apart=True) or own
+    time, unit = time_beside(columns, names[0], *own, separate=True) or own
     return {"truth_time": time, "truth_time_unit": unit}
 
 
@@ -211,22 +211,22 @@ def _said_apart(columns: Columns, clock: tuple[str, str], own: tuple[str, str]) 
     return ": their clocks share no time" if start > last or end < first else ""
 
 
-def _why_no_turns(columns: Columns, leaves: dict[str, str], bodies: list[dict[str, str]], apart: str) -> list[str]:
+def _why_no_turns(columns: Columns, leaves: dict[str, str], bodies: list[dict[str, str]], reason: str) -> list[str]:
     """Reasons why the rotations of a group make no poses."""
     array = next((c[:-3] for c in leaves.values() if c.endswith("[3]") and f"{c[:-3]}[4]" not in columns.values), "")
     named = [array] if array else next(filter(None, map(numbered_quaternion, bodies)), [])
     if named:
         return [f"{', '.join(named)} has four columns of no certain order; `quaternion_wxyz` of a map makes poses of them"]
     if nine := matrix_of(leaves):
-        said = f"{NOT_ALIKE}, nor do their transposes{apart}"
-        return [f"the matrices {nine[0]}, ... {said}; `rotation_matrix` of a map, row by row, makes poses of them"]
+        text = f"{NOT_ALIKE}, nor do their transposes{reason}"
+        return [f"the matrices {nine[0]}, ... {text}; `rotation_matrix` of a map, row by row, makes poses of them"]
     if three := next(iter(angles_of(leaves)), []):
-        said = f"{NOT_ALIKE}, as Rz(yaw) Ry(pitch) Rx(roll){apart}"
-        return [f"{', '.join(three)} {said}; `roll_pitch_yaw` of a map makes poses of them"]
+        text = f"{NOT_ALIKE}, as Rz(yaw) Ry(pitch) Rx(roll){reason}"
+        return [f"{', '.join(three)} {text}; `roll_pitch_yaw` of a map makes poses of them"]
     return []
 
 
-def time_beside(columns: Columns, column: str, time: str, unit: str, *, apart: bool = False) -> tuple[str, str] | None:
+def time_beside(columns: Columns, column: str, time: str, unit: str, *, separate: bool = False) -> tuple[str, str] | None:
     """Time in the group of a column or in one around it, if not the IMU's, and its unit."""
     length = len(columns.values[column])
     if "/" not in column and not columns.has_structures and length == len(columns.values[time]):
@@ -241,14 +241,14 @@ def time_beside(columns: Columns, column: str, time: str, unit: str, *, apart: b
         group = group_of(group)
     if not found or time in found:
         return None
-    together = (_with_unit(columns, each, time, unit, apart=False) for each in found)
-    return next(filter(None, together), None) or _with_unit(columns, found[0], time, unit, apart=apart)
+    together = (_with_unit(columns, each, time, unit, separate=False) for each in found)
+    return next(filter(None, together), None) or _with_unit(columns, found[0], time, unit, separate=separate)
 
 
-def _with_unit(columns: Columns, other: str, time: str, unit: str, *, apart: bool) -> tuple[str, str] | None:
+def _with_unit(columns: Columns, other: str, time: str, unit: str, *, separate: bool) -> tuple[str, str] | None:
     """A time beside the IMU's, and its unit.
 
-    A unit that is not stated is the one in which it covers the IMU's time best; of a clock `apart` from the IMU's the one in
+    A unit that is not stated is the one in which it covers the IMU's time best; of a clock `separate` from the IMU's the one in
     which it lasts about as long.
     """
     stated = name_and_unit(other, columns.units.get(other, ""))[1]
@@ -261,9 +261,9 @@ def _with_unit(columns: Columns, other: str, time: str, unit: str, *, apart: boo
         overlap[each] = (min(end, last) - max(start, first)) / (max(end, last) - min(start, first))
         longer[each] = max((end - start) / (last - first), (last - first) / (end - start))
     best, alike = max(overlap, key=lambda each: overlap[each]), min(longer, key=lambda each: longer[each])
-    if overlap[best] > LEAST_OVERLAP:
+    if overlap[best] > MIN_OVERLAP:
         return other, best
-    return (other, alike) if apart and longer[alike] < MOST_LONGER else None
+    return (other, alike) if separate and longer[alike] < MAX_LONGER else None
 
 
 def is_time(column: str) -> bool:
@@ -277,7 +277,7 @@ def measured(columns: Columns) -> list[str]:
     Poses that are true are none, nor are parameters, which are shorter, and raw counts beside what is calibrated.
     """
     longest = max(map(len, columns.values.values()), default=0)
-    long = [c for c, values in columns.values.items() if len(values) > MOST_CONSTANTS or longest <= MOST_CONSTANTS]
+    long = [c for c, values in columns.values.items() if len(values) > MAX_CONSTANTS or longest <= MAX_CONSTANTS]
     counts = _raw_counts(columns)
     return [column for column in long if not is_true(column) and column not in counts]
 

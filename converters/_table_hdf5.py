@@ -16,7 +16,7 @@ from ._table_names import unit_named
 from ._table_text import Columns
 from ._table_units import TIME_NS
 
-MOST_CELLS = 10_000  # of a cell array
+MAX_CELLS = 10_000  # of a cell array
 FILLS = "_FillValue", "missing_value"  # attributes that say what stands for a missing value
 SINCE = re.compile(  # of the CF conventions, in UTC
     r"(?P<unit>[a-z]+) since (?P<day>\d{4}-\d\d?-\d\d?)([T ]+(?P<clock>\d\d?:\d\d?:\d\d?)(\.0*)?)? *(Z|UTC|[+-]?0?0(:?00)?)?",
@@ -128,7 +128,7 @@ def _since_1970(values: np.ndarray, unit: str) -> np.ndarray | None:
 
 def _add_cells(columns: Columns, name: str, node: Any, path: Path) -> None:
     """Add the arrays and groups that a cell array, or a field of a structure's elements, leads to."""
-    if node.size > MOST_CELLS:
+    if node.size > MAX_CELLS:
         columns.remarks.losses.append(f"{name} is left out: it has {node.size} cells")
         return
     cells = [node.file[reference] for reference in node[()].ravel() if reference]

@@ -13,7 +13,7 @@ from imutool.recording.message_log import Remarks
 from ._table_names import TIME_WORDS, UNITS, distinct_names, split_name, unit_named
 from ._table_numbers import fields_of, is_number
 
-MOST_WORDS = 10  # in a refusal
+MAX_WORDS = 10  # in a refusal
 MOSTLY = 0.8  # share of columns above which a text says nothing of a column
 UNIT_TEXT = re.compile(r"[\[(]?(\W*|[a-zµ°]+([ /*^²\d-]+[a-z\d²-]*)*|-)[\])]?", re.IGNORECASE)
 SENSOR_UNITS = "|".join(UNITS[unit] for unit in ("rad/s", "deg/s", "mdeg/s", "m/s^2", "cm/s^2", "ft/s^2", "mg", "g"))
@@ -103,10 +103,10 @@ def note_unused_header(above: list[str], delimiter: str | None, names: list[str]
     """Say of the line above the rows that it names no column, where it seems to."""
     fields = fields_of(above, delimiter)[-1] if above and delimiter is not None else []
     if names[:1] == ["column 1"] and 1 < len(fields) < len(names) and not any(map(is_number, fields)):
-        said = f"the line above the rows has {len(fields)} fields and the rows {len(names)}: it names no column"
+        note = f"the line above the rows has {len(fields)} fields and the rows {len(names)}: it names no column"
         is_header = any(re.fullmatch(TIME_WORDS, name) or unit for name, unit in map(split_name, fields))
         # else it may be a title
-        (remarks.losses if is_header else remarks.notes).append(f"{said} ({', '.join(fields)[:200]})")
+        (remarks.losses if is_header else remarks.notes).append(f"{note} ({', '.join(fields)[:200]})")
 
 
 def refuse_other_header(fields: list[list[str]], path: Path) -> None:
@@ -123,5 +123,5 @@ def refuse_other_header(fields: list[list[str]], path: Path) -> None:
         words = [texts[row] for texts in fields]
         are_names = len({*words}) > len(words) / 2 and all(re.match(r"[^\W\d]", word) for word in words)
         if are_names or all(map(unit_named, words)):
-            what = f"has another header below {row} rows: {', '.join(words[:MOST_WORDS])}"
+            what = f"has another header below {row} rows: {', '.join(words[:MAX_WORDS])}"
             raise DataError(what, where=path, expected="one", fix="Give the rows below each header a table of their own")

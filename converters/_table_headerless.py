@@ -32,10 +32,10 @@ ROS_IMU = [  # `ros2 topic echo --csv` of sensor_msgs/Imu
     *(f"linear_acceleration_covariance{place}" for place in SQUARE),
 ]
 LOOKED_AT = 200  # first lines, which show the words between the numbers
-LEAST_ROWS, LEAST_SHARE = 5, 0.3  # of the lines looked at that have the same words; status lines may stand between
-LEAST_TENTH = 0.5  # of the median length, which 90 % of an accelerometer's readings exceed
-LEAST_NUMBERS, LEAST_LABELS = 4, 2  # in a row
-WIDE, MOST_ROWS = 7, 20_000  # more columns than a time and an IMU; rows that are compared
+MIN_ROWS, MIN_SHARE = 5, 0.3  # of the lines looked at that have the same words; status lines may stand between
+MIN_TENTH = 0.5  # of the median length, which 90 % of an accelerometer's readings exceed
+MIN_NUMBERS, MIN_LABELS = 4, 2  # in a row
+WIDE, MAX_ROWS = 7, 20_000  # more columns than a time and an IMU; rows that are compared
 LONGEST_LINE, LONGEST_LABEL = 2_000, 80  # characters; the search for labels costs the square of their length
 NUMBER = re.compile(
     r"(?<![\w.^/])(\d{4}-\d\d-\d\d[T ]\d\d?:\d\d:\d\d(?:[.,]\d+)?Z?|\d\d?:\d\d:\d\d(?:[.,]\d+)?"
@@ -111,11 +111,11 @@ def _turning(columns: Columns, names: list[str]) -> _Halves | None:
     units = units_of_time(float(t[0]), usual_step(t)) if rises(columns.values[names[0]]) else []
     if len(units) != 1:
         return None
-    values = {name: columns.values[name].astype(float)[:MOST_ROWS] for name in names[1:]}
+    values = {name: columns.values[name].astype(float)[:MAX_ROWS] for name in names[1:]}
     triples = [[*names[first : first + 3]] for first in range(1, len(names) - 2)]
     sizes = [np.linalg.norm([values[name] for name in three], axis=0) for three in triples]
     accels = [three for three, size in zip(triples, sizes, strict=True) if _has_gravity(columns, three) and np.ptp(size) > 1e-3]
-    t_ns = np.rint((t - t[0]) * TIME_NS[units[0]]).astype(np.int64)[:MOST_ROWS]
+    t_ns = np.rint((t - t[0]) * TIME_NS[units[0]]).astype(np.int64)[:MAX_ROWS]
     best, surest = None, 0.0
     for accel, gyro in product(accels, triples):
         if not {*accel} & {*gyro} and (np.diff(t_ns) > 0).all():
@@ -135,7 +135,7 @@ def _has_gravity(columns: Columns, triple: list[str], factor: float = 1.0) -> bo
     level, near = gravity_units(columns, triple, factor)
     near = near if factor == 1.0 else [unit for unit in near if unit == "m/s^2"]
     tenth = float(np.nanquantile(np.linalg.norm(values, axis=0), 0.1))
-    return bool(near) and tenth > LEAST_TENTH * level and not np.isin(values, (-1, 0, 1)).all()
+    return bool(near) and tenth > MIN_TENTH * level and not np.isin(values, (-1, 0, 1)).all()
 
 
 def _place_of_time(columns: Columns) -> int:
@@ -186,7 +186,7 @@ def as_table(text: str) -> tuple[str, int, int]:
     lines = [line for line in text.splitlines() if line.strip()]
     counts = Counter(words for line in lines[:LOOKED_AT] if (words := _words(line)))
     words, count = max(counts.items(), key=lambda each: each[1], default=((), 0))
-    if count < max(LEAST_ROWS, LEAST_SHARE * len(lines[:LOOKED_AT])):
+    if count < max(MIN_ROWS, MIN_SHARE * len(lines[:LOOKED_AT])):
         return "", 0, 0
     rows = ["\t".join(match[1] for match in NUMBER.finditer(line)) for line in lines if _words(line) == words]
     labels = {match[0].strip() for text in words if (match := LABEL.search(text[-LONGEST_LABEL:]))}
@@ -203,7 +203,7 @@ def _words(line: str) -> tuple[str, ...]:
         " ".join(STATE.sub(" *", text).split()) for text in NUMBER.split(line)[::2]
     )  # numbers may be padded to a width
     named = sum(bool(LABEL.search(text[-LONGEST_LABEL:])) for text in words[:-1])
-    return words if len(words) > LEAST_NUMBERS and named >= LEAST_LABELS and not any(map(SIGN.search, words)) else ()
+    return words if len(words) > MIN_NUMBERS and named >= MIN_LABELS and not any(map(SIGN.search, words)) else ()
 
 
 def _names(words: tuple[str, ...]) -> list[str]:

@@ -30,10 +30,10 @@ START = re.compile(r'\s*(\{\s*"|\[\s*(\{\s*"|\[|-?\d+(\.\d+)?([eE][-+]?\d+)?\s*,
 NEXT = re.compile(rb"\}\s*\{")  # an object behind another, without a comma
 NOT_FINITE = re.compile(rb"[\[:,]\s*-?(NaN|Infinity)\b")
 NO_JSON = msgspec.DecodeError, ValueError, RecursionError
-LEAST_ROWS = 5  # objects of an array that is a table
-MOST_NUMBERS = 9  # or words, in an array that belongs to one sample, as a matrix does
-MOST_DAMAGED = 0.1  # share of the lines that a logger cut off or garbled
-LEAST_SHARE = 0.05  # of the rows that have the same fields, if they are of a kind of their own
+MIN_ROWS = 5  # objects of an array that is a table
+MAX_NUMBERS = 9  # or words, in an array that belongs to one sample, as a matrix does
+MAX_DAMAGED = 0.1  # share of the lines that a logger cut off or garbled
+MIN_SHARE = 0.05  # of the rows that have the same fields, if they are of a kind of their own
 FAR = 2**1000  # beyond which an integer is no float64
 Row = dict[str, Any]
 
@@ -65,7 +65,7 @@ def load_json(path: Path, columns: Columns) -> None:
     for name, rows in tables.items():
         part, text = Columns(), _text(rows)
         if not read_rows(text, part, path):
-            read_csv(text, part, path, least=1)
+            read_csv(text, part, path, minimum=1)
         if len(tables) == 1:
             beside = name.removesuffix(name.rpartition(".")[2])  # as a rate beside the samples: `imu.frequency`, `imu.data`
             columns.numbers = {number.removeprefix(beside): value for number, value in columns.numbers.items()}
@@ -93,7 +93,7 @@ def _decoded(path: Path, columns: Columns) -> Any:
         with suppress(*NO_JSON):
             if damaged:
                 return _value(b"[" + NEXT.sub(b"},{", raw) + b"]")
-        if len(values) < LEAST_ROWS or damaged > MOST_DAMAGED * len(lines):
+        if len(values) < MIN_ROWS or damaged > MAX_DAMAGED * len(lines):
             what = f"begins as JSON and cannot be read ({error})"
             raise DataError(what, where=path, expected="one JSON document, or one JSON value a line") from error
         if damaged:
@@ -117,7 +117,7 @@ def _value(raw: bytes) -> Any:
 
 def _nodes(node: Any, name: str) -> Iterator[tuple[str, Any]]:
     """Arrays and single numbers of a document, with dotted names; rows by their numbers, as of pandas, are an array."""
-    if isinstance(node, dict) and len(node) >= LEAST_ROWS and next(iter(node)) in ("0", "1"):
+    if isinstance(node, dict) and len(node) >= MIN_ROWS and next(iter(node)) in ("0", "1"):
         first = int(next(iter(node)))
         node = [*node.values()] if [*node] == [str(n) for n in range(first, first + len(node))] else node
     if isinstance(node, dict):
@@ -131,11 +131,11 @@ def _nodes(node: Any, name: str) -> Iterator[tuple[str, Any]]:
         return
     elif isinstance(node, int | float):
         yield name or "value", node
-    elif len(node) >= LEAST_ROWS and all(isinstance(row, dict) for row in node):
+    elif len(node) >= MIN_ROWS and all(isinstance(row, dict) for row in node):
         yield name, node
     elif _is_matrix(node):
         yield from ((f"{name}[{n}]" if name else f"column {n + 1}", [row[n] for row in node]) for n in range(len(node[0])))
-    elif len(node) >= LEAST_ROWS and (_are(node, int | float | None) or _are(node, str)):
+    elif len(node) >= MIN_ROWS and (_are(node, int | float | None) or _are(node, str)):
         yield name or "values", node
     else:
         for number, child in enumerate(node):
@@ -155,7 +155,7 @@ def _numbers(values: list[Any]) -> np.ndarray:
 def _is_matrix(node: Any) -> bool:
     return (
         isinstance(node, list)
-        and len(node) >= LEAST_ROWS
+        and len(node) >= MIN_ROWS
         and all(isinstance(row, list) and len(row) == len(node[0]) > 1 for row in node)
         and all(isinstance(value, int | float | None) for row in node for value in row)
     )
@@ -182,7 +182,7 @@ def _kinds(records: list[Row]) -> dict[str, list[Row]]:
     """
     every = [row for record in records for row in _rows(record)]
     counts = Counter(frozenset(row) for row in every)
-    large = [fields for fields, count in counts.items() if count > LEAST_SHARE * len(every)]
+    large = [fields for fields, count in counts.items() if count > MIN_SHARE * len(every)]
     own = [fields.difference(*(other for other in large if other is not fields)) for fields in large]
     if len(large) < 2 or not all(own):
         return {"": every}
@@ -218,7 +218,7 @@ def _flatten(node: Row, name: str, flat: Row, batches: dict[str, list[Any]]) -> 
             _flatten(value, inner, flat, batches)
         elif not isinstance(value, list):
             flat[inner] = value
-        elif len(value) <= MOST_NUMBERS and not any(isinstance(each, dict | list) for each in value):
+        elif len(value) <= MAX_NUMBERS and not any(isinstance(each, dict | list) for each in value):
             flat |= {f"{inner}[{n}]": each for n, each in enumerate(value)}
         else:
             batches[inner] = value

@@ -20,14 +20,14 @@ from ._table_packed import opener, text_head
 from ._table_pose_names import has_poses, has_turns, pose_leaves
 from ._table_propose import propose
 from ._table_sensors import name_columns
-from ._table_text import LEAST_NUMBERS, Columns, is_text_table, read_csv, text_of
+from ._table_text import MIN_NUMBERS, Columns, is_text_table, read_csv, text_of
 from ._table_units import TIME_NS
 
-MOST_LOOKED = 64 << 20  # bytes of a table that is no text
+MAX_LOOKED = 64 << 20  # bytes of a table that is no text
 LAST_BYTES = 4096  # of a text, which hold its last row
 NARROW = 2  # numbers in a row of a time and a reading
-LEAST_VECTOR = 3  # numbers in a row of a sensor
-MOST_LARGER = 1.2  # ratio of the sizes of files, or of the times, of IMUs that were recorded together
+MIN_VECTOR = 3  # numbers in a row of a sensor
+MAX_LARGER = 1.2  # ratio of the sizes of files, or of the times, of IMUs that were recorded together
 SINCE_1970_NS = 10**18  # in 2001; smaller times may count from any start
 logger = logging.getLogger(__package__)  # whose records `_unpacking` renames
 
@@ -52,7 +52,7 @@ class Seen(NamedTuple):
 
 
 def look(path: Path) -> Seen:
-    """What the first rows of a text show, or a table of up to `MOST_LOOKED` bytes, once."""
+    """What the first rows of a text show, or a table of up to `MAX_LOOKED` bytes, once."""
     status = path.stat()
     return _looked(path, status.st_mtime_ns, status.st_size)
 
@@ -62,10 +62,10 @@ def _looked(path: Path, mtime_ns: int, size: int) -> Seen:  # the key notices a 
     columns, kind = Columns(), kind_of(head(path), path)
     start = _start(path, kind)
     if start and (is_mocap(start) or not kind):
-        read_csv(start, columns, path, least=LEAST_NUMBERS if kind else NARROW)
+        read_csv(start, columns, path, minimum=MIN_NUMBERS if kind else NARROW)
     elif start:
         read_text(start, columns, path)
-    elif kind not in ("csv", "") and size <= MOST_LOOKED:
+    elif kind not in ("csv", "") and size <= MAX_LOOKED:
         try:
             columns = load(path, kind)
         except (DataError, ConfigError) as error:
@@ -96,7 +96,7 @@ def _spanned(path: Path, mtime_ns: int, size: int) -> tuple[int, int] | None:
     columns, start = Columns(), text_of(head(path)).rpartition("\n")[0]
     if "\0" in start or opener(head(path)):
         return None
-    read_csv(f"{start}\n{last}\n", columns, path, least=LEAST_VECTOR)
+    read_csv(f"{start}\n{last}\n", columns, path, minimum=MIN_VECTOR)
     entries = propose(columns).entries if columns.values else {}
     if "time" not in entries or entries.get("time_unit", "") not in TIME_NS:
         return None
@@ -122,7 +122,7 @@ def recorded_apart(groups: dict[Path, str], tables: list[Path]) -> list[list[Pat
     whole = {key: [*pair, *(path for path, keys in of.items() if keys == [key])] for key, pair in pairs.items()}
     if min(start for start, _ in known.values()) < SINCE_1970_NS:
         lasting = [max(known[path][1] - known[path][0] for path in pair) for pair in pairs.values()]
-        return [*whole.values()] if max(lasting) > MOST_LARGER * min(lasting) else []
+        return [*whole.values()] if max(lasting) > MAX_LARGER * min(lasting) else []
     parts, end = list[list[Path]](), 0
     for key, pair in sorted(pairs.items(), key=lambda each: min(known[path] for path in each[1])):
         if min(known[path][0] for path in pair) > end:

@@ -79,8 +79,8 @@ class TableMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def described(self) -> dict[str, str]:
         """Entries that say something; columns as `a, b, c`."""
         blank = msgspec.structs.asdict(TableMap())
-        said = {key: value for key, value in msgspec.structs.asdict(self).items() if value != blank[key] or key == "topic"}
-        return {key: ", ".join(map(str, value)) if isinstance(value, list) else str(value) for key, value in said.items()}
+        entries = {key: value for key, value in msgspec.structs.asdict(self).items() if value != blank[key] or key == "topic"}
+        return {key: ", ".join(map(str, value)) if isinstance(value, list) else str(value) for key, value in entries.items()}
 
 
 def read_map(mapping: Path | Mapping[str, Any]) -> Entries:
@@ -135,8 +135,8 @@ def within_groups(given: Entries, columns: Columns) -> Entries:
     beside = {c for e in TRUE_ENTRIES & given.keys() for c in np.atleast_1d(given[e]).tolist() if c.startswith(POSE_GROUPS)}
     if beside and not any(column.startswith(POSE_GROUPS) for column in columns.values):
         out = {entry: value for entry, value in given.items() if entry not in {*TRUE_ENTRIES, "truth_time_unit", "pose_kind"}}
-        left = ", ".join(sorted(given.keys() - out.keys()))
-        columns.remarks.notes.append(f"no table of poses is beside it: {left} are left out")
+        unused = ", ".join(sorted(given.keys() - out.keys()))
+        columns.remarks.notes.append(f"no table of poses is beside it: {unused} are left out")
     for entry in {*LISTS, *CLOCKS} & out.keys():
         of_imu = entry not in TRUE_ENTRIES
         if of_imu or "truth_file" not in given:

@@ -34,9 +34,9 @@ JOINED = "time [ns]"
 MILLISECONDS = re.compile(r"(m|milli)s(ec(ond)?s?)?|millis", re.IGNORECASE)
 ALWAYS = 0.99  # share of the steps of a time that do not go back
 POSITIONS = r"(.*_)?(pos(e|ition)?s?|translations?|traj(ectory)?|locations?|xyz)(_.*)?"  # names of a table of positions
-MOST_UNTIMED = 0.01  # share of the rows of a table that may lack its time: a mean below them, a garbled field
-MOST_STEPS = 4.0  # median steps of positions, over which none are interpolated
-QUARTER_NS, FARTHEST_NS, MOST_OFF_NS = 900 * 10**9, 14 * 3600 * 10**9, 60 * 10**9  # of zones; between two clocks of a table
+MAX_UNTIMED = 0.01  # share of the rows of a table that may lack its time: a mean below them, a garbled field
+MAX_STEPS = 4.0  # median steps of positions, over which none are interpolated
+QUARTER_NS, FARTHEST_NS, MAX_OFF_NS = 900 * 10**9, 14 * 3600 * 10**9, 60 * 10**9  # of zones; between two clocks of a table
 SINCE_NS = 10**18  # in 2001; smaller times may count from any start
 SINCE_1970 = rf"(.*_)?{TIME_WORDS}|.*(since_?1970|epoch|unix|posix).*"
 TIME_OF = rf"((?P<before>.+?)_)?{TIME_WORDS}|{TIME_WORDS}_(?P<behind>.+)"  # imu_time, time_gps
@@ -93,8 +93,8 @@ def join_calendar(columns: Columns) -> None:
         columns.texts.pop(found[part], None)
     columns.values, columns.units[JOINED] = {JOINED: t_ns, **columns.values}, "ns"
     columns.local_times.extend([JOINED] if has_date else [])
-    said = ", ".join(repr(found[part]) for part in wanted)
-    columns.remarks.notes.append(f"{said} are one time, which names no zone and counts as UTC")
+    names = ", ".join(repr(found[part]) for part in wanted)
+    columns.remarks.notes.append(f"{names} are one time, which names no zone and counts as UTC")
 
 
 def join_milliseconds(columns: Columns) -> None:
@@ -140,7 +140,7 @@ def settle_zones(columns: Columns) -> None:
                 continue
             ahead_ns = dates - np.rint(times).astype(np.int64)
             zone_ns = np.rint(ahead_ns / QUARTER_NS).astype(np.int64) * QUARTER_NS
-            if np.abs(ahead_ns - zone_ns).max() < MOST_OFF_NS and 0 < np.abs(zone_ns).max() <= FARTHEST_NS:
+            if np.abs(ahead_ns - zone_ns).max() < MAX_OFF_NS and 0 < np.abs(zone_ns).max() <= FARTHEST_NS:
                 columns.values[local] = dates - zone_ns
                 hours = " and ".join(f"{each / 3.6e12:+g} h" for each in np.unique(zone_ns))
                 columns.remarks.notes.append(f"{local} is in a zone of {hours} by {column!r}, and is UTC in the log")
@@ -169,28 +169,28 @@ def sort_by_clock(columns: Columns) -> None:
         return
     timed = np.any([*clocks.values()], axis=0)
     if any((rows & ~timed).any() for rows in known.values()):
-        if len(clocks) > 1 or np.mean(~timed) > MOST_UNTIMED:
+        if len(clocks) > 1 or np.mean(~timed) > MAX_UNTIMED:
             return
         first = f"the first is row {int((~timed).argmax()) + 1}"
-        said = f"{int((~timed).sum())} rows without a number in {next(iter(clocks))!r} are left out"
-        columns.remarks.losses.append(f"{said} ({first})")
+        note = f"{int((~timed).sum())} rows without a number in {next(iter(clocks))!r} are left out"
+        columns.remarks.losses.append(f"{note} ({first})")
     groups = {c: named[c]["before"] or named[c]["behind"] or c for c in clocks}
-    apart = Columns()
+    separate = Columns()
     if [*groups.values()] == [*clocks] and len(clocks) == 1:  # of one table, with blank rows
         for column in [c for c in known if known[c].any()]:
-            _take_rows(columns, column, timed, apart, column)
-        columns.values, columns.units, columns.texts = apart.values, apart.units, apart.texts
+            _take_rows(columns, column, timed, separate, column)
+        columns.values, columns.units, columns.texts = separate.values, separate.units, separate.texts
         return
     for column in [c for c in known if c not in clocks and known[c].any()]:
         holders = [clock for clock, rows in clocks.items() if not (known[column] & ~rows).any()]
         smallest = [min(holders, key=lambda clock: clocks[clock].sum())] if holders else [*clocks]
         for clock in smallest:
-            _take_rows(columns, column, clocks[clock], apart, f"{groups[clock]}/{column}")
+            _take_rows(columns, column, clocks[clock], separate, f"{groups[clock]}/{column}")
     for clock, rows in clocks.items():
-        _take_rows(columns, clock, rows, apart, f"{groups[clock]}/time")
-        apart.units[f"{groups[clock]}/time"] = columns.units.get(clock) or name_and_unit(clock, "")[1]
+        _take_rows(columns, clock, rows, separate, f"{groups[clock]}/time")
+        separate.units[f"{groups[clock]}/time"] = columns.units.get(clock) or name_and_unit(clock, "")[1]
     columns.remarks.notes.append(f"each of {', '.join(clocks)} is the time of the rows in which it stands")
-    columns.values, columns.units, columns.texts = apart.values, apart.units, apart.texts
+    columns.values, columns.units, columns.texts = separate.values, separate.units, separate.texts
 
 
 def _cut_blocks(columns: Columns, known: dict[str, np.ndarray], clocks: dict[str, np.ndarray]) -> None:
@@ -200,7 +200,7 @@ def _cut_blocks(columns: Columns, known: dict[str, np.ndarray], clocks: dict[str
     """
     if next(iter(known)) not in clocks or all(rows.all() for rows in clocks.values()):
         return
-    apart, of, groups = Columns(), "", dict[str, str]()
+    separate, of, groups = Columns(), "", dict[str, str]()
     for column, rows in known.items():
         of = column if column in clocks else of
         count = int(clocks[of].sum())
@@ -208,11 +208,11 @@ def _cut_blocks(columns: Columns, known: dict[str, np.ndarray], clocks: dict[str
             return
         name = "time" if column == of else column
         groups[column] = f"block {[*clocks].index(of) + 1}/{name}"
-        _take_rows(columns, column, clocks[of], apart, groups[column])
+        _take_rows(columns, column, clocks[of], separate, groups[column])
         if column == of:
-            apart.units[groups[column]] = columns.units.get(column) or name_and_unit(column, "")[1]
+            separate.units[groups[column]] = columns.units.get(column) or name_and_unit(column, "")[1]
     columns.remarks.notes.append(f"each of {', '.join(clocks)} is the time of the columns behind it, and of as many rows")
-    columns.values, columns.units, columns.texts = apart.values, apart.units, apart.texts
+    columns.values, columns.units, columns.texts = separate.values, separate.units, separate.texts
 
 
 def _take_rows(columns: Columns, column: str, rows: np.ndarray, into: Columns, name: str) -> None:
@@ -245,10 +245,10 @@ def join_positions(columns: Columns) -> None:
     if units[0] != units[1] or len(t_p) < 2:
         return
     behind = np.clip(np.searchsorted(t_p, t), 1, len(t_p) - 1)
-    is_known = (t >= t_p[0]) & (t <= t_p[-1]) & (np.diff(t_p)[behind - 1] <= MOST_STEPS * np.median(np.diff(t_p)))
+    is_known = (t >= t_p[0]) & (t <= t_p[-1]) & (np.diff(t_p)[behind - 1] <= MAX_STEPS * np.median(np.diff(t_p)))
     for axis, column in zip("xyz", position, strict=True):
         name = f"{group}/position_{axis}"
         columns.values[name] = np.where(is_known, np.interp(t, t_p, columns.values[column].astype(float)), np.nan)
         columns.units[name] = name_and_unit(column, columns.units.get(column, ""))[1]
-    said = f"the positions of {columns.sources[other]} are interpolated to the times of {columns.sources[group]}"
-    columns.remarks.notes.append(f"{said}, which has orientations")
+    note = f"the positions of {columns.sources[other]} are interpolated to the times of {columns.sources[group]}"
+    columns.remarks.notes.append(f"{note}, which has orientations")

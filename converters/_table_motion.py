@@ -16,7 +16,7 @@ from ._table_pose_names import axes_of
 from ._table_text import Columns
 from ._table_units import ACCEL_SI, GYRO_SI, STANDARD_GRAVITY, TIME_NS, gravity_units, is_motion_alone
 
-LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
+MIN_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
 STEADY_BAND = 0.3  # share by which the steady part of the acceleration may differ from gravity
 DECIDING_BAND = 0.15  # the same, where it decides the unit
 NO_GRAVITY = r"(user|free)_?acc"  # in names of accelerations without gravity
@@ -47,8 +47,8 @@ def add_gravity(columns: Columns) -> None:
         columns.values[f"specific_force_{axis} [g]"] = each
         if not re.search(NO_GRAVITY, spaced_name(own)):  # no second accelerometer
             columns.values[f"user_{own}"] = columns.values.pop(own)
-    said = f"{motion[0]}/y/z and {gravity[0]}/y/z are of CoreMotion, which takes gravity out and reads -1 g upwards"
-    columns.remarks.notes.append(f"{said}: the specific force is minus their sum")
+    note = f"{motion[0]}/y/z and {gravity[0]}/y/z are of CoreMotion, which takes gravity out and reads -1 g upwards"
+    columns.remarks.notes.append(f"{note}: the specific force is minus their sum")
 
 
 def doubt_gravity(proposal: Proposal, columns: Columns) -> None:
@@ -57,14 +57,14 @@ def doubt_gravity(proposal: Proposal, columns: Columns) -> None:
         return
     chosen = [columns.unsigned(column) for column in proposal.entries["accel"]]
     name, (level, _) = spaced_name(chosen[0]), gravity_units(columns, chosen)
-    said = f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}"
+    note = f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}"
     if re.search(NO_GRAVITY, name):
-        proposal.reasons.append(f"{said}, and by its name gravity was taken out")
-    elif level * ACCEL_SI[unit] < LEAST_GRAVITY:
-        proposal.reasons.append(f"{said}, much less than gravity: it was taken out, or the unit is another")
+        proposal.reasons.append(f"{note}, and by its name gravity was taken out")
+    elif level * ACCEL_SI[unit] < MIN_GRAVITY:
+        proposal.reasons.append(f"{note}, much less than gravity: it was taken out, or the unit is another")
     elif is_motion_alone(columns, chosen) and not re.search(WITH_GRAVITY, name) and not _keeps_gravity(proposal, columns):
         why = "it often is much smaller, and all cancel out"
-        proposal.reasons.append(f"{said}, {why}: gravity was taken out, or the body turned upside down and back")
+        proposal.reasons.append(f"{note}, {why}: gravity was taken out, or the body turned upside down and back")
     else:
         return
     proposal.open.append("accel")

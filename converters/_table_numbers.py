@@ -13,8 +13,8 @@ GROUPED = re.compile(r"[+-]?(0|[1-9]\d{0,2}(\.\d{3})*)(,\d+)?")  # 1.234.567,8
 WHOLE_NUMBER = re.compile(r"[+-]?\d{1,19}")
 SAMPLED = 200  # rows that show which columns are whole numbers
 EXACT = 2.0**15  # larger numbers that are not whole keep their texts: seconds since 1970 and days lose nanoseconds as float64
-MOST_BACK = 0.25  # share of the steps of a time that go back
-MOST_ODD = 0.1  # share of the fields of a column of numbers that are none: `-`, `ERR`, a garbled line
+MAX_BACK = 0.25  # share of the steps of a time that go back
+MAX_ODD = 0.1  # share of the fields of a column of numbers that are none: `-`, `ERR`, a garbled line
 
 
 def plain_columns(lines: list[str], delimiter: str | None) -> tuple[list[np.ndarray | None], list[list[str]]] | None:
@@ -56,7 +56,7 @@ def plain_columns(lines: list[str], delimiter: str | None) -> tuple[list[np.ndar
 def _is_rounded_time(column: np.ndarray) -> bool:
     """Whether a column may be a time that float64 rounds; it seldom goes back."""
     is_large = column.dtype.kind == "f" and bool((np.abs(column) > EXACT).any())
-    return is_large and bool((np.diff(column) < 0.0).sum() <= MOST_BACK * len(column))
+    return is_large and bool((np.diff(column) < 0.0).sum() <= MAX_BACK * len(column))
 
 
 def _count(line: str, delimiter: str | None) -> int:
@@ -125,7 +125,7 @@ def numbers(texts: list[str]) -> tuple[np.ndarray, list[str]] | None:
                 pass
     found = [_number(text) for text in texts]
     odd = [text for text, number in zip(texts, found, strict=True) if number is None and text]
-    if len(odd) > MOST_ODD * len(texts):
+    if len(odd) > MAX_ODD * len(texts):
         return None
     return np.array([np.nan if number is None else number for number in found]), odd
 

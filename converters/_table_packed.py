@@ -32,7 +32,7 @@ UTF16 = b"\xff\xfe", b"\xfe\xff"
 ZSTD = b"\x28\xb5\x2f\xfd"
 ZSTD_STEP = 1 << 10  # packed bytes: a block of four bytes can unpack to 128 KiB
 SAMPLED, LONGEST_LINE = 1000, 1 << 16  # lines from all over a text, which show whether its time begins anew
-MOST_FALLS = 0.3  # of a time, by its rises
+MAX_FALLS = 0.3  # of a time, by its rises
 FOREIGN = lzma.LZMAError, zstandard.ZstdError  # errors of damaged bytes that are no OSError
 
 
@@ -97,14 +97,14 @@ def read_bytes(path: Path) -> bytes:
     """
     if opener(head(path)) is None:
         return path.read_bytes()
-    most = min(LIMIT, MAX_RATIO * path.stat().st_size + RATIO_FREE)
+    maximum = min(LIMIT, MAX_RATIO * path.stat().st_size + RATIO_FREE)
     parts: list[bytes] = []
     total = 0
     for piece in pieces(path):
         parts.append(piece)
         total += len(piece)
-        if total > most:
-            raise DataError(f"unpacks to more than {most} bytes", where=path, expected=f"at most {MAX_RATIO} to 1")
+        if total > maximum:
+            raise DataError(f"unpacks to more than {maximum} bytes", where=path, expected=f"at most {MAX_RATIO} to 1")
     return b"".join(parts)
 
 
@@ -138,7 +138,7 @@ def goes_back(path: Path) -> bool:
         steps = [later - number for number, later in pairwise(numbers)]
         if len(numbers) < len(column) / 2:  # dates, which rise as texts do
             steps = [(later > text) - (later < text) for text, later in pairwise(column)]
-        if 0 < sum(step < 0 for step in steps) <= MOST_FALLS * sum(step > 0 for step in steps):
+        if 0 < sum(step < 0 for step in steps) <= MAX_FALLS * sum(step > 0 for step in steps):
             return True
     return False
 

@@ -25,11 +25,11 @@ from ._table_names import TIME_WORDS, group_of, is_of_recordings, is_of_sensors,
 from ._table_recordings import distinct, groups_apart, part_name, renamed
 from ._table_text import Columns, no_numbers
 from ._table_times import is_counter
-from ._table_wraps import LEAST_ROWS, begun_anew
+from ._table_wraps import MIN_ROWS, begun_anew
 
 NOT_BACK, UP = 0.99, 0.5  # shares of the steps of a time that do not go back, and that go on
-MOST_SAID = 5  # rows
-MOST_BY_TURNS = 60  # recordings whose rows come by turns
+MAX_SAID = 5  # rows
+MAX_BY_TURNS = 60  # recordings whose rows come by turns
 FIX = (
     "Leave `rate_hz` out if a column is the time of each row; else give each recording a table of its own, or name the column"
     " that tells them apart `trial`"
@@ -103,7 +103,7 @@ def _texts(values: np.ndarray) -> np.ndarray | None:
         if not np.isfinite(values).all() or (values % 1.0 != 0.0).any():
             return None
         values = values.astype(np.int64)
-    return values.astype(str) if 2 <= len(np.unique(values)) <= len(values) / LEAST_ROWS else None
+    return values.astype(str) if 2 <= len(np.unique(values)) <= len(values) / MIN_ROWS else None
 
 
 def _labels(columns: Columns, is_named: Callable[[str], bool]) -> dict[int, Labels]:
@@ -171,10 +171,10 @@ def _begun(columns: Columns) -> dict[int, Labels]:
     if len(bounds) != 1:
         return {}
     (_, *rows, length), lengths = next(iter(bounds)), np.diff(next(iter(bounds)))
-    if not rows or lengths.min() < LEAST_ROWS:
+    if not rows or lengths.min() < MIN_ROWS:
         return {}
-    said = f"{', '.join(map(repr, times))} begins anew in row {', '.join(str(row + 1) for row in rows[:MOST_SAID])}"
-    columns.remarks.notes.append(f"{said}{', ...' if len(rows) > MOST_SAID else ''}: {len(lengths)} recordings")
+    note = f"{', '.join(map(repr, times))} begins anew in row {', '.join(str(row + 1) for row in rows[:MAX_SAID])}"
+    columns.remarks.notes.append(f"{note}{', ...' if len(rows) > MAX_SAID else ''}: {len(lengths)} recordings")
     return {length: {"part": np.repeat(np.arange(1, len(lengths) + 1).astype(str), lengths)}}
 
 
@@ -187,8 +187,8 @@ def _apart(columns: Columns, length: int, labels: Labels, *, always: bool = Fals
         return {"": np.arange(length)}
     codes = _codes(labels)
     runs = np.concatenate([[0], np.cumsum(np.diff(codes) != 0)])
-    in_blocks = runs[-1] + 1 <= len(runs) / LEAST_ROWS
-    if not in_blocks and codes.max() >= MOST_BY_TURNS:  # a counter
+    in_blocks = runs[-1] + 1 <= len(runs) / MIN_ROWS
+    if not in_blocks and codes.max() >= MAX_BY_TURNS:  # a counter
         return {"": np.arange(len(codes))}
     groups = runs if in_blocks else codes
     order = np.argsort(groups, kind="stable")
@@ -240,8 +240,8 @@ def _texts_in(texts: list[str], rows: Rows | None) -> list[str]:
 
 def _leave_out_losses(part: Columns, columns: Columns, used: list[str]) -> None:
     """Take back that columns of texts are lost, which tell recordings or sensors apart."""
-    said = [no_numbers(n, columns.labels[name]) for name in used if name in columns.labels for n in (name, leaf_of(name))]
-    part.remarks.losses[:] = [loss for loss in part.remarks.losses if not loss.endswith(tuple(said))]
+    texts = [no_numbers(n, columns.labels[name]) for name in used if name in columns.labels for n in (name, leaf_of(name))]
+    part.remarks.losses[:] = [loss for loss in part.remarks.losses if not loss.endswith(tuple(texts))]
 
 
 def _grouped(columns: Columns, length: int, sensors: Labels) -> Columns:

@@ -73,8 +73,8 @@ def why_no_poses(columns: Columns, group: str) -> str:
     leaves = {leaf: own[name] for name, (_, leaf) in pose_leaves(own).items()}
     if position_of(leaves) and not has_turns(leaves):
         return "it has positions without orientations, and imutool uses no positions alone; its columns are topics of the log"
-    said = "no time with positions and rotations of a certain order was found in it"
-    return f"{said}; a map names its columns (truth_time, position, quaternion_wxyz or another rotation)"
+    reason = "no time with positions and rotations of a certain order was found in it"
+    return f"{reason}; a map names its columns (truth_time, position, quaternion_wxyz or another rotation)"
 
 
 def numbered_quaternion(leaves: dict[str, str]) -> list[str]:

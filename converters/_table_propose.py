@@ -40,10 +40,10 @@ from ._table_units import (
 
 RANGES = 250, 500, 1000, 2000  # deg/s, of InvenSense's gyros
 NEAR_FEET = 0.05  # share by which an acceleration may differ from gravity in ft/s^2, as one of 3.3 g in m/s^2 does
-LEAST_COUNTS = 50.0  # of gravity in whole numbers
+MIN_COUNTS = 50.0  # of gravity in whole numbers
 LONGEST_STEP_NS = 5e8  # of increments
 ROUNDING = 1e-6  # of the span of a column's values, by which a copy of it may differ
-MOST_SHOWN = 12  # triples of columns in a message
+MAX_SHOWN = 12  # triples of columns in a message
 NOTHING: Entries = {}
 
 
@@ -105,11 +105,11 @@ def _propose_sensor(
         proposal.reasons.append(f"of {len(found)} accelerations {whole[0]['x']}/y/z is the one with gravity")
     if len(pair := sorted(whole, key=lambda each: _range_of(each) != "ln")) == 2 and [*map(_range_of, pair)] == ["ln", "wr"]:
         whole = pair[:1]
-        said = f"{pair[0]['x']}/y/z is the low-noise accelerometer of two, which has the smaller range"
-        proposal.reasons.append(f"{said}: a map can name {pair[1]['x']}/y/z in its place")
+        note = f"{pair[0]['x']}/y/z is the low-noise accelerometer of two, which has the smaller range"
+        proposal.reasons.append(f"{note}: a map can name {pair[1]['x']}/y/z in its place")
     if len(whole) != 1:
         proposal.open += [sensor] if whole else [sensor, f"{sensor}_unit"]
-        shown = ", ".join(f"{triple['x']}/y/z" for triple in whole[:MOST_SHOWN])
+        shown = ", ".join(f"{triple['x']}/y/z" for triple in whole[:MAX_SHOWN])
         how_many = f"{len(whole)} triples of" if whole else "no"
         proposal.reasons.append(f"{how_many} columns look like the {sensor}{': ' * bool(shown)}{shown}")
     if not whole:
@@ -141,8 +141,8 @@ def _propose_stated(
         level, near = gravity_units(columns, chosen) if sensor == "accel" else (0.0, [])
         if near and unit not in near:
             proposal.open.append("accel_unit")
-            said = f"the median acceleration is {level:.4g}: gravity in {' or '.join(near)}"
-            proposal.reasons.append(f"by their names the columns may be in {unit}, and {said}")
+            note = f"the median acceleration is {level:.4g}: gravity in {' or '.join(near)}"
+            proposal.reasons.append(f"by their names the columns may be in {unit}, and {note}")
     else:
         _propose_unit(proposal, sensor, columns)
 
@@ -178,11 +178,11 @@ def _with_gravity(found: Sequence[dict[str, str]], columns: Columns) -> Sequence
 def _propose_gyro_unit(proposal: Proposal, columns: Columns, given: Entries) -> None:
     """Unit of the gyro from the steps in which it counts, and from how gravity turns in the accelerometer."""
     steps = unit_by_steps(columns.side_by_side(proposal.entries["gyro"]))
-    said = f"the gyro counts in steps of {steps[1]:.6g} {steps[0]}, as a common sensor does" if steps else ""
+    note = f"the gyro counts in steps of {steps[1]:.6g} {steps[0]}, as a common sensor does" if steps else ""
     stated = proposal.entries.get("gyro_unit", "")
     if stated and steps and steps[0] != stated and "gyro_unit" not in given:
         proposal.open.append("gyro_unit")
-        proposal.reasons.append(f"the names of the columns say {stated}, and {said}")
+        proposal.reasons.append(f"the names of the columns say {stated}, and {note}")
     elif stated and not {*proposal.open} | ({"gyro", "gyro_unit"} & given.keys()) and not _states_unit(proposal, columns):
         motion = unit_by_motion(proposal, columns)
         if motion and motion[0] != stated:
@@ -191,7 +191,7 @@ def _propose_gyro_unit(proposal: Proposal, columns: Columns, given: Entries) -> 
     if "gyro_unit" not in proposal.open or stated:
         return
     motion = unit_by_motion(proposal, columns) if {*proposal.open} <= {"gyro_unit", "accel_unit"} else None
-    found = {unit: reason for unit, reason in ((steps[0] if steps else "", said), motion or ("", "")) if unit}
+    found = {unit: reason for unit, reason in ((steps[0] if steps else "", note), motion or ("", "")) if unit}
     if len(found) == 1:
         proposal.settle_unit("gyro", *found.popitem())
     else:
@@ -207,7 +207,7 @@ def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:
     """Unit from the magnitude: gravity shows that of an accelerometer; no magnitude shows that of a gyro."""
     if sensor == "accel":
         level, near = gravity_units(columns, proposal.unsigned(sensor, columns))
-        is_coarse = level < LEAST_COUNTS and _are_whole(columns.side_by_side(proposal.unsigned(sensor, columns)))
+        is_coarse = level < MIN_COUNTS and _are_whole(columns.side_by_side(proposal.unsigned(sensor, columns)))
         near = [] if is_coarse else near  # whole m/s^2 are counts of something else
         if len(near) == 1:
             proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {near[0]}")
@@ -225,13 +225,13 @@ def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:
         elif abs(level * ACCEL_SI["ft/s^2"] / STANDARD_GRAVITY - 1.0) < NEAR_FEET:
             proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in ft/s^2?")
         if raw := raw_counts(columns.side_by_side(proposal.entries[sensor])):
-            said = f"±{raw[0]} g ({raw[1]} counts a g)"
+            note = f"±{raw[0]} g ({raw[1]} counts a g)"
             proposal.reasons.append(
-                f"the accel holds whole numbers of a median length of {level:.4g}: raw counts of a range of {said}?"
+                f"the accel holds whole numbers of a median length of {level:.4g}: raw counts of a range of {note}?"
             )
             first, *others = (f"{1.0 / counts:.8g}" for counts in COUNTS_A_DPS[: len(RANGES)])
             proposal.hints += [
-                f'accel_scale = {1.0 / raw[1]!r}  # with accel_unit = "g", if these are raw counts of {said}',
+                f'accel_scale = {1.0 / raw[1]!r}  # with accel_unit = "g", if these are raw counts of {note}',
                 f'gyro_scale = {first}  # with gyro_unit = "deg/s", for raw counts of ±{RANGES[0]} deg/s;'
                 f" of ±{', ±'.join(map(str, RANGES[1:]))}: {', '.join(others)}",
             ]

@@ -60,7 +60,7 @@ def distinct(name: str, others: Mapping[str, object]) -> str:
     """The name, or `name 2` for one that others have."""
     if name not in others:
         return name
-    return next(again for number in count(2) if (again := f"{name} {number}") not in others)
+    return next(unused for number in count(2) if (unused := f"{name} {number}") not in others)
 
 
 def _parents(columns: Columns) -> list[str]:
@@ -90,8 +90,8 @@ def renamed(columns: Columns, names: Mapping[str, str]) -> Columns:
 
 def _without(remarks: Remarks, labels: list[str]) -> Remarks:
     """Remarks but for those on other tables, which begin with their labels."""
-    theirs = tuple(f"{label}: " for label in labels)
-    notes, losses = ([each for each in said if not each.startswith(theirs)] for said in (remarks.notes, remarks.losses))
+    prefixes = tuple(f"{label}: " for label in labels)
+    notes, losses = ([each for each in texts if not each.startswith(prefixes)] for texts in (remarks.notes, remarks.losses))
     return replace(remarks, notes=notes, losses=losses)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ._table_groups import TRUE_GROUPS
-from ._table_look import MOST_LARGER, look
+from ._table_look import MAX_LARGER, look
 from ._table_map import IMU_GROUP, POSES_GROUP, TRUTH_GROUP
 from ._table_sensors import SENSORS, SPACED, WORD, pairs_among, plain_among, sensors_among
 
@@ -85,4 +85,4 @@ def role_groups(tables: Names) -> dict[Path, str]:
 def _of_one_size(paths: list[Path]) -> bool:
     """Whether files have about as many bytes, as those of IMUs that were recorded together have."""
     sizes = [path.stat().st_size for path in paths]
-    return max(sizes) < MOST_LARGER * min(sizes)
+    return max(sizes) < MAX_LARGER * min(sizes)

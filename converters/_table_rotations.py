@@ -19,21 +19,21 @@ from ._table_text import Columns
 from ._table_units import ANGLE_SI, GYRO_SI, TIME_NS
 
 SPAN_S, LONG_SPAN_S = 0.1, 0.3  # over which turns are compared; over the second, noise of the poses is a smaller part
-MOST_SPANS, LEAST_S = 5.0, 5.0  # multiple of a span that has a gap in it, and the least time to compare
-MOST_S = 300.0  # of a longer table, those that turn most
+MAX_SPANS, MIN_S = 5.0, 5.0  # multiple of a span that has a gap in it, and the least time to compare
+MAX_S = 300.0  # of a longer table, those that turn most
 SURE, CLEARLY = 0.9, 0.25  # correlation of turns that are the same; share of what the other order leaves that the right one may
-LIKELY, MOST_OFF = 0.6, 1.35  # correlation with poses that jump; ratio of turns in one unit, as the next is a factor of 57 away
+LIKELY, MAX_OFF = 0.6, 1.35  # correlation with poses that jump; ratio of turns in one unit, as the next is a factor of 57 away
 ORTHOGONAL = 0.02  # what two printed decimals leave of R R^T = 1
-NOT_UNIT, MOST_NOT_UNIT = 0.01, 0.1  # error of a quaternion's length, and the share of them that may have it
+NOT_UNIT, MAX_NOT_UNIT = 0.01, 0.1  # error of a quaternion's length, and the share of them that may have it
 ORDERS, ORDER_NAMES = ((0, 1, 2, 3), (3, 0, 1, 2)), ("wxyz", "xyzw")  # of w, x, y, z in an array
 UP = np.cos(np.radians(25.0))  # of the mean force in a world whose z axis points up
 INVERSE = np.array([1.0, -1.0, -1.0, -1.0])  # of a unit quaternion
 EITHER_WAY = ", and the other way, too: the motion has too few axes to tell"
 TURNS = {"quaternion_wxyz", "rotation_matrix", "roll_pitch_yaw"}  # entries of a map that name rotations
-MOST_RAD = 2.0 * np.pi + 1e-3  # beyond which angles are degrees
+MAX_RAD = 2.0 * np.pi + 1e-3  # beyond which angles are degrees
 SPANS_S = SPAN_S, LONG_SPAN_S, 1.0  # over which angles are compared, often rounded to 0.1 degrees, or of poses that jump
 DELAYS_S = (*(sign * tenth / 10.0 for tenth in range(11) for sign in (1, -1)),)  # of a clock of the poses' own, none first
-MOST_IN_ROWS_S = 0.2  # delay of poses in the rows of the IMU
+MAX_IN_ROWS_S = 0.2  # delay of poses in the rows of the IMU
 
 
 def of_matrices(matrices: Float64[np.ndarray, "n 3 3"], where: Path | None = None) -> Float64[np.ndarray, "n 4"]:
@@ -71,13 +71,13 @@ def known_rotations(q_wxyz: Float64[np.ndarray, "n 4"], topic: str) -> tuple[Boo
     length = np.linalg.norm(q_wxyz, axis=1)
     missing = ~(length > 0.0)
     off = ~missing & (np.abs(length - 1.0) > NOT_UNIT)
-    if off.sum() > MOST_NOT_UNIT * (~missing).sum():  # these are no quaternions
+    if off.sum() > MAX_NOT_UNIT * (~missing).sum():  # these are no quaternions
         off[:] = False
     notes = [f"{topic}: {missing.sum()} samples without a pose are left out"] if missing.any() else []
     if off.any():
         row = int(np.argmax(off))
-        said = f"{off.sum()} quaternions whose length is not 1 are left out, the first in row {row + 1}: {q_wxyz[row].tolist()}"
-        notes.append(f"{topic}: {said}")
+        note = f"{off.sum()} quaternions whose length is not 1 are left out, the first in row {row + 1}: {q_wxyz[row].tolist()}"
+        notes.append(f"{topic}: {note}")
     return ~missing & ~off, notes
 
 
@@ -88,12 +88,12 @@ def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock:
     gravity leaves it open and it alone turns about the gyro's own axes.
     """
     values = columns.side_by_side(array)
-    ways = [values[:, order] for order in ORDERS]
-    best, is_shown = _way_by_motion(columns, entries, ways, clock)
+    candidates = [values[:, order] for order in ORDERS]
+    best, is_shown = _way_by_motion(columns, entries, candidates, clock)
     if best is None:
         return [], ""
     gyro, at_s, other = _GyroTurns.of(columns, entries), seconds_of(columns, clock), 1 - best
-    pair = ways[best], ways[other] * INVERSE
+    pair = candidates[best], candidates[other] * INVERSE
     for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
         own, inverse = turns = [_turns_alike(gyro, way, at_s - delay_s, span_s) for way in pair]
         if min(own.correlation, inverse.correlation) > SURE:
@@ -128,14 +128,14 @@ def up_share(
 
 def matrix_by_motion(columns: Columns, entries: Entries, nine: list[str], clock: tuple[str, str]) -> tuple[list[str], bool]:
     """Nine columns of a matrix or its transpose that turns as the gyro; whether it shows which."""
-    ways = nine, [nine[place] for place in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
-    turns = [rotations(columns, {"rotation_matrix": way}) for way in ways]
+    candidates = nine, [nine[place] for place in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
+    turns = [rotations(columns, {"rotation_matrix": way}) for way in candidates]
     best, is_shown = _way_by_motion(columns, entries, turns, clock)
-    return ([] if best is None else ways[best]), is_shown
+    return ([] if best is None else candidates[best]), is_shown
 
 
 def _way_by_motion(
-    columns: Columns, entries: Entries, ways: Sequence[Float64[np.ndarray, "n 4"]], clock: tuple[str, str]
+    columns: Columns, entries: Entries, candidates: Sequence[Float64[np.ndarray, "n 4"]], clock: tuple[str, str]
 ) -> tuple[int | None, bool]:
     """Which of two readings of a rotation turns as the gyro does, and whether motion shows it.
 
@@ -144,7 +144,7 @@ def _way_by_motion(
     """
     gyro, at_s, fits_both = _GyroTurns.of(columns, entries), seconds_of(columns, clock), False
     for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
-        turns = [_turns_alike(gyro, way, at_s - delay_s, span_s) for way in ways]
+        turns = [_turns_alike(gyro, way, at_s - delay_s, span_s) for way in candidates]
         for found in ([turn.correlation for turn in turns], [turn.same_axes for turn in turns]):
             best = int(np.argmax(found))
             if found[best] > SURE and _is_clear(found[best], min(found)):
@@ -158,29 +158,29 @@ def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock
 
     A yaw that counts the other way has a minus. Two signs that change together are another body and world, no other turn.
     """
-    ways: dict[tuple[str, str], Entries] = {
+    candidates: dict[tuple[str, str], Entries] = {
         (unit, yaw): {"roll_pitch_yaw": [*three[:2], yaw + three[2]], "roll_pitch_yaw_unit": unit}
         for unit, yaw in product(_angle_units(columns, three), ("", "-"))
     }
-    turns = {way: rotations(columns, named) for way, named in ways.items()}
+    turns = {way: rotations(columns, named) for way, named in candidates.items()}
     gyro, at_s = _GyroTurns.of(columns, entries), seconds_of(columns, clock)
     size = GYRO_SI.get(str(entries.get("gyro_unit", "")), 0.0)
     for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
         found = {}
         for way, q_wxyz in turns.items():
             turn = _turns_alike(gyro, q_wxyz, at_s - delay_s, span_s)
-            is_alike = not size or 1.0 / MOST_OFF < turn.slope / size < MOST_OFF
+            is_alike = not size or 1.0 / MAX_OFF < turn.slope / size < MAX_OFF
             found[way] = turn.correlation if is_alike else 0.0
         unit, yaw = max(found, key=lambda way: found[way])
         best, other_unit = found[unit, yaw], max((r for (u, _), r in found.items() if u != unit), default=0.0)
         if best > SURE and _is_clear(best, other_unit):
-            return ways[unit, "-" if _is_clear(found[unit, "-"], found[unit, ""]) else ""]
+            return candidates[unit, "-" if _is_clear(found[unit, "-"], found[unit, ""]) else ""]
     return {}
 
 
 def _delays(entries: Entries, clock: tuple[str, str]) -> list[float]:
     """Delays between poses and gyro to try, the smallest first; less in rows of the IMU, which may be of another device."""
-    return [delay_s for delay_s in DELAYS_S if clock[0] != entries["time"] or abs(delay_s) <= MOST_IN_ROWS_S]
+    return [delay_s for delay_s in DELAYS_S if clock[0] != entries["time"] or abs(delay_s) <= MAX_IN_ROWS_S]
 
 
 def _is_clear(correlation: float, other: float) -> bool:
@@ -195,7 +195,7 @@ def _angle_units(columns: Columns, three: list[str]) -> list[str]:
     values = columns.side_by_side(three)
     if len(stated) == 1:
         return [*stated]
-    return ["rad", "deg"] if np.isfinite(values).any() and np.nanmax(np.abs(values)) < MOST_RAD else ["deg"]
+    return ["rad", "deg"] if np.isfinite(values).any() and np.nanmax(np.abs(values)) < MAX_RAD else ["deg"]
 
 
 def unit_by_poses(columns: Columns, entries: Entries) -> str:
@@ -206,7 +206,7 @@ def unit_by_poses(columns: Columns, entries: Entries) -> str:
     at_s = seconds_of(columns, (str(entries["truth_time"]), str(entries["truth_time_unit"])))
     for span_s in (SPAN_S, LONG_SPAN_S):
         turn = _turns_alike(gyro, q_wxyz, at_s, span_s)
-        near = [unit for unit, size in GYRO_SI.items() if 1.0 / MOST_OFF < turn.slope / size < MOST_OFF]
+        near = [unit for unit, size in GYRO_SI.items() if 1.0 / MAX_OFF < turn.slope / size < MAX_OFF]
         if turn.correlation > LIKELY and near:
             return near[0]
     return ""
@@ -233,15 +233,15 @@ class _GyroTurns(NamedTuple):
 
     @classmethod
     def of(cls, columns: Columns, entries: Entries) -> _GyroTurns:
-        """Angles over the `MOST_S` seconds that turn most; none without a time for each rate."""
+        """Angles over the `MAX_S` seconds that turn most; none without a time for each rate."""
         names = [str(entries["time"]), *entries["gyro"]]
         if len({len(columns.values[columns.unsigned(name)]) for name in names}) > 1:
             return cls(np.zeros(0), np.zeros((0, 3)))
         t, rates = columns.values[names[0]].astype(float), columns.side_by_side(names[1:])
         known = np.isfinite(t)
         t, rates = t[known] * TIME_NS[str(entries["time_unit"])] * 1e-9, np.where(np.isfinite(rates), rates, 0.0)[known]
-        if len(t) and t[-1] - t[0] > MOST_S and (np.diff(t) >= 0.0).all():
-            ends, power = np.searchsorted(t, t + MOST_S), np.cumsum((rates**2).sum(axis=1))
+        if len(t) and t[-1] - t[0] > MAX_S and (np.diff(t) >= 0.0).all():
+            ends, power = np.searchsorted(t, t + MAX_S), np.cumsum((rates**2).sum(axis=1))
             start = int(np.argmax(power[ends - 1] - power))
             t, rates = t[start : ends[start]], rates[start : ends[start]]
         steps = 0.5 * (rates[1:] + rates[:-1]) * np.diff(t)[:, None]
@@ -271,8 +271,8 @@ def _turns_alike(
     step = max(1, round(span_s / max(float(np.median(np.diff(at))), 1e-9))) if len(at) > 1 else 1
     at, q = at[::step], q[::step]
     spans = np.diff(at)
-    kept = (spans > 0.0) & (spans < MOST_SPANS * span_s)
-    if spans[kept].sum() < LEAST_S:
+    kept = (spans > 0.0) & (spans < MAX_SPANS * span_s)
+    if spans[kept].sum() < MIN_S:
         return _Alike(0.0, 0.0, 0.0, np.eye(3))
     turned = quaternion.log(quaternion.multiply(quaternion.inverse(q[:-1]), q[1:]))[kept]
     measured = np.diff(np.stack([np.interp(at, gyro.t_s, angle) for angle in gyro.angles.T], axis=1), axis=0)[kept]

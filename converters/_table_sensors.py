@@ -30,7 +30,7 @@ WORD = r"[A-Z]?[a-z]+|[A-Z]+"
 POSE = ["time", *(f"position_{a}" for a in "xyz"), *(f"quaternion[{k}]" for k in range(4))]
 SPACED = r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"  # UncalGyroXRadPerSec
 ANDROID, ANDROIDS = r"TYPE_[A-Z_]+", {"gyro": "rad/s", "accel": "m/s^2"}  # constants of Android, which states these units
-MOST_NAMES, LEAST_ROWS = 60, 20
+MAX_NAMES, MIN_ROWS = 60, 20
 LOOKED_AT = 200_000  # first characters of a text, which show whether its rows name sensors
 EPOCH, ELAPSED = r"(?i)epoch?\b", r"(?i)(.*[ _])?elapsed\b"
 NEAR_ONE = 0.01
@@ -40,7 +40,7 @@ KIND = r"[@$%/]?[A-Za-z][\w/.:-]*|/[\w/.:-]+"  # a word that names the kind of a
 OTHER = "other"  # kind of the rows that name none
 FLAGS = r"(?i)true|false|yes|no|on|off|ok|none|nan|[a-z]"  # words that a device writes of its state
 DEVICE = r"(?i)(sensor|device|imu|node|unit)([ _]?(id|no|nr|num(ber)?|index|name))?|id|mac|address"  # in a header
-BY_TURNS, LEAST_SHARE = 0.2, 0.1  # of rows that are of another device than the one before; of the rows, of each device
+BY_TURNS, MIN_SHARE = 0.2, 0.1  # of rows that are of another device than the one before; of the rows, of each device
 
 
 def sensors_among(names: Iterable[str]) -> dict[str, str]:
@@ -108,7 +108,7 @@ def read_rows(text: str, columns: Columns, path: Path) -> bool:
         stated = (match for line in lines if (match := re.search(rf"\b{re.escape(name + mark)}(.*[a-zA-Z].*)", line)))
         above = next((match[1].rstrip("'\" ") for match in stated if match.string.startswith(COMMENTS)), None)
         part = Columns()
-        read_csv("\n".join([*(header if above is None else [above]), *table]), part, path, least=2)
+        read_csv("\n".join([*(header if above is None else [above]), *table]), part, path, minimum=2)
         group = sensors.get(name, name)
         if name in sensors:
             part.remarks.notes.append(f"its rows are the {group}")
@@ -145,16 +145,16 @@ def _rows_of_kinds(start: str) -> tuple[str, int, dict[str, str]] | None:
         kinds = [row[place].strip().strip('"') for row in long]
         counts = Counter(kinds)
         by_name = place < len(header) and re.fullmatch(DEVICE, header[place].strip())
-        if not 2 <= len(counts) <= MOST_NAMES or len(kinds) < LEAST_ROWS * len(counts):
+        if not 2 <= len(counts) <= MAX_NAMES or len(kinds) < MIN_ROWS * len(counts):
             continue
         are_words = all(re.fullmatch(KIND, kind) for kind in counts)
         widths: dict[str, set[int]] = {}
         for row, kind in zip(long, kinds, strict=True):
             widths.setdefault(kind, set()).add(len(row))
-        apart = len(set.union(*widths.values())) > 1 and (are_words or all(len(each) == 1 for each in widths.values()))
-        turns = sum(one != other for one, other in pairwise(kinds)) / len(kinds)
-        by_turns = turns > BY_TURNS and min(counts.values()) > LEAST_SHARE * len(kinds) / len(counts)
-        if not header and apart:
+        are_separate = len(set.union(*widths.values())) > 1 and (are_words or all(len(each) == 1 for each in widths.values()))
+        turns = sum(first != other for first, other in pairwise(kinds)) / len(kinds)
+        by_turns = turns > BY_TURNS and min(counts.values()) > MIN_SHARE * len(kinds) / len(counts)
+        if not header and are_separate:
             return mark, place, {}
         if by_turns and (by_name or (are_words and not any(re.fullmatch(FLAGS, kind) for kind in counts))):
             return mark, place, {}
@@ -166,8 +166,8 @@ def _sensor_rows(start: str) -> tuple[str, int, dict[str, str]] | None:
     mark, rows = _split_rows(start)
     for place in range(PLACES if rows else 0):
         counts = Counter(row[place].strip() for row in rows if len(row) > place)
-        sensors = sensors_among(name for name, count in counts.items() if count >= LEAST_ROWS)
-        if len(counts) <= MOST_NAMES and {*sensors.values()} == {*SENSORS}:
+        sensors = sensors_among(name for name, count in counts.items() if count >= MIN_ROWS)
+        if len(counts) <= MAX_NAMES and {*sensors.values()} == {*SENSORS}:
             return mark, place, sensors
     return None
 

@@ -22,7 +22,7 @@ from ._source import head
 from ._table_sensors import SENSORS, name_columns, pairs_among, sensors_among
 from ._table_text import Columns, is_text_table, read_csv
 
-MOST_CELLS = 1 << 25  # of a sheet: a gigabyte
+MAX_CELLS = 1 << 25  # of a sheet: a gigabyte
 LONGEST = 200  # letters of a cell that are kept
 CHUNK, ZIP = 1 << 22, b"PK"
 CELL = re.compile(rb"<(?:\w+:)?c\s[^<>]*?\br\s*=\s*[\"']([A-Za-z]{1,7})(\d{1,10})[\"']")
@@ -41,8 +41,8 @@ def load_sheets(path: Path, columns: Columns, read: Reader) -> None:
     """
     texts = dict(_sheets(path))
     tables = {name: text for name, text in texts.items() if is_text_table(text.encode(), 2) and not re.fullmatch(DETAILS, name)}
-    if left := ", ".join(name for name, text in texts.items() if name not in tables and text):
-        columns.remarks.notes.append(f"sheets without rows of numbers, or about the recording, are left out: {left}")
+    if unread := ", ".join(name for name, text in texts.items() if name not in tables and text):
+        columns.remarks.notes.append(f"sheets without rows of numbers, or about the recording, are left out: {unread}")
     if len(tables) == 1:
         read(next(iter(tables.values())), columns, path)
         return
@@ -53,7 +53,7 @@ def load_sheets(path: Path, columns: Columns, read: Reader) -> None:
         if is_text_table(text.encode()):
             read(text, part, path)
         else:  # a time and a number
-            read_csv(text, part, path, least=2)
+            read_csv(text, part, path, minimum=2)
         name_columns(part, sensor if (sensor := group.rpartition("/")[2]) in SENSORS else "")
         columns.take(group, part, f"sheet {name}")
 
@@ -85,7 +85,7 @@ def _check_members(path: Path, mtime_ns: int, size: int) -> None:  # the key not
 
 
 def _check_cells(chunks: Iterator[bytes], path: Path, member: zipfile.ZipInfo) -> None:
-    """Refuse a sheet whose cells span more than `MOST_CELLS`, or that unpacks beyond all proportion.
+    """Refuse a sheet whose cells span more than `MAX_CELLS`, or that unpacks beyond all proportion.
 
     Raises:
         DataError: with the cell.
@@ -101,11 +101,11 @@ def _check_cells(chunks: Iterator[bytes], path: Path, member: zipfile.ZipInfo) -
             for letter in letters.upper():
                 column = 26 * column + letter - ord("A") + 1
             rows, width = max(rows, row), max(width, column)
-            if rows * width > MOST_CELLS:
+            if rows * width > MAX_CELLS:
                 what = f"has a cell {letters.decode()}{row}, which makes {rows} rows of {width} columns"
                 fix = "Delete the rows and columns behind the table, or save the sheet as CSV (UTF-8)"
                 raise DataError(
-                    what, where=f"{path}/{member.filename}", expected=f"at most {MOST_CELLS} cells in a sheet", fix=fix
+                    what, where=f"{path}/{member.filename}", expected=f"at most {MAX_CELLS} cells in a sheet", fix=fix
                 )
         rest = text[-256:]
 

@@ -37,8 +37,8 @@ from ._table_packed import UTF16
 
 WIDEST = 64  # columns of a matrix; wider ones are images
 MAX_LINE = 65_536
-LEAST_NUMBERS = 4  # in a row: a time and a vector
-LEAST_NAMED = 0.1  # share of the rows that have as many fields as the header, if it is theirs
+MIN_NUMBERS = 4  # in a row: a time and a vector
+MIN_NAMED = 0.1  # share of the rows that have as many fields as the header, if it is theirs
 LOOKED_AT = 200  # first lines, which show whether text is a table
 FIRSTS = 50  # rows that show what a column without a name counts
 AROUND = "\ufeff \t"  # a header that a program has written again
@@ -152,40 +152,40 @@ def _with_arrivals(text: str) -> str:
     return re.sub(ARRIVAL.pattern, rf"\1{mark}", named, flags=re.MULTILINE)
 
 
-def is_text_table(head: bytes, least: int = LEAST_NUMBERS) -> bool:
+def is_text_table(head: bytes, minimum: int = MIN_NUMBERS) -> bool:
     """Whether text has a row of at least so many numbers."""
     if b"\0" in head and not head.startswith(UTF16):
         return False
     text = text_of(head)
     lines = text.splitlines()
     rows = [line for line in (lines if text.endswith("\n") else lines[:-1] or lines) if line.strip()]  # the last may be cut
-    delimiter = _delimiter(rows, least)
-    return any(_is_row(row, delimiter, least) for row in rows[:LOOKED_AT])
+    delimiter = _delimiter(rows, minimum)
+    return any(_is_row(row, delimiter, minimum) for row in rows[:LOOKED_AT])
 
 
-def _delimiter(rows: list[str], least: int) -> str | None:
-    """What separates most rows into equally many fields of which `least` are numbers; None for white space.
+def _delimiter(rows: list[str], minimum: int) -> str | None:
+    """What separates most rows into equally many fields of which `minimum` are numbers; None for white space.
 
     Where each row may be one number with a decimal comma, a header of as many names shows two.
     """
     looked, marks = rows[:LOOKED_AT], (";", "\t", ",", "|", None)
-    widths = {mark: Counter(len(row.split(mark)) for row in looked if _is_row(row, mark, least)) for mark in marks}
+    widths = {mark: Counter(len(row.split(mark)) for row in looked if _is_row(row, mark, minimum)) for mark in marks}
     best = max(marks, key=lambda mark: max(widths[mark].values(), default=0))  # of equals the first
-    headers = {len(row.split(",")) for row in looked if not _is_row(row, ",", least)}
+    headers = {len(row.split(",")) for row in looked if not _is_row(row, ",", minimum)}
     return "," if [*widths[best]] == [1] and [*widths[","]] == [2] and 2 in headers else best
 
 
-def _is_row(line: str, delimiter: str | None, least: int) -> bool:
-    """Whether a line has `least` numbers."""
+def _is_row(line: str, delimiter: str | None, minimum: int) -> bool:
+    """Whether a line has `minimum` numbers."""
     fields = [] if line.startswith(COMMENTS) else line.split(delimiter)
     if any(mark in line for mark in "[(") and delimiter is not None:
         (fields,) = fields_of([line], delimiter)
         fields = [number for field in fields for number in vector(field) or [field]]
-    return sum(map(is_number, fields)) >= least
+    return sum(map(is_number, fields)) >= minimum
 
 
-def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS) -> None:
-    """Add the columns of a table of text with `least` numbers in a row.
+def read_csv(text: str, columns: Columns, path: Path, minimum: int = MIN_NUMBERS) -> None:
+    """Add the columns of a table of text with `minimum` numbers in a row.
 
     `path` is its address for messages.
 
@@ -195,8 +195,8 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
     lines = [line for line in text.splitlines() if line.strip()]
     if any(len(line) > MAX_LINE for line in lines):
         raise DataError("has a line of more than 65 536 characters", where=path, expected="a table of text")
-    delimiter = _delimiter(lines, least)
-    first = next((n for n, line in enumerate(lines) if _is_row(line, delimiter, least)), len(lines))
+    delimiter = _delimiter(lines, minimum)
+    first = next((n for n, line in enumerate(lines) if _is_row(line, delimiter, minimum)), len(lines))
     several = (
         part for line in lines[:first] if line.startswith(COMMENTS) for part in re.split(r", |: (?=.*=)| (?=\w+=\S)", line)
     )
@@ -204,9 +204,9 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
     columns.numbers |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in stated}
     above = {line.strip(AROUND) for line in lines[:first]}
     kept = lines[:first] + [line for line in lines[first:] if line.strip(AROUND) not in above]
-    if again := len(lines) - len(kept):  # as of files that were joined
+    if repeated := len(lines) - len(kept):  # as of files that were joined
         lines = kept
-        columns.remarks.notes.append(f"{again} lines that repeat the header are left out")
+        columns.remarks.notes.append(f"{repeated} lines that repeat the header are left out")
     body, grouped = without_thousands(lines[first:], delimiter)
     values, fields, width = _columns_of(body, lines[:first], delimiter, columns)
     refuse_other_header(fields, path)
@@ -233,8 +233,8 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
             texts[:] = pointed
             commas.append(name)
         add_fields(columns, name, texts, units.get(name, ""))
-    if left := ", ".join(filter(None, empty)):
-        columns.remarks.notes.append(f"columns without a value are left out: {left}")
+    if unread := ", ".join(filter(None, empty)):
+        columns.remarks.notes.append(f"columns without a value are left out: {unread}")
     columns.remarks.notes.extend([f"decimal commas are read as points: {', '.join(commas)}"] if commas else [])
 
 
@@ -296,5 +296,5 @@ def _width(rows: list[list[str]], above: list[list[str]]) -> int:
     A row may be longer than its table: two that a board wrote at once, or a note.
     """
     counts = Counter(map(len, rows))
-    named = {len(row) for row in above} & {width for width, count in counts.items() if count > LEAST_NAMED * len(rows)}
+    named = {len(row) for row in above} & {width for width, count in counts.items() if count > MIN_NAMED * len(rows)}
     return max(named or counts, key=lambda width: (counts[width], width), default=0)

@@ -28,13 +28,13 @@ COUNTER = r"packet|count|index|seq|frame|sample(?![ _]?time)"  # in the name of 
 FEWEST_STAMPS = 3  # that change, for the rate of the rows that share them
 FEWEST_BATCHES = 8  # that show how many rows have one stamp
 ROWS_APART, ROWS_ALIKE = 0.5, 0.8  # most by which the rows of a stamp differ from the usual number, and the share that does not
-MOST_STEP = 4.0  # of a counter; a column of larger steps may be a clock
-MOST_SKIPPED = 0.1  # share of a counter's steps that lost samples make longer; more may be packets of other sensors
-MOST_ODD = 0.01  # share of its steps that are no multiple of the usual one
+MAX_STEP = 4.0  # of a counter; a column of larger steps may be a clock
+MAX_SKIPPED = 0.1  # share of a counter's steps that lost samples make longer; more may be packets of other sensors
+MAX_ODD = 0.01  # share of its steps that are no multiple of the usual one
 GPS_TIME = "gps_time [ns]"
 GPS_WEEK = r"(.*_)?(gps_?)?(week|wk|gwk|wn)(_?(no?|num(ber)?))?"
 TIME_OF_WEEK = r"(.*_)?((gps_?)?(tow|sow|time_?of_?week|sec(onds)?_?of_?week)|gps_?(time|sec(onds)?))"
-LEAST_WEEK, MOST_WEEK = 990, 5000  # of 1999, before which receivers counted again from 0, and of 2075
+MIN_WEEK, MAX_WEEK = 990, 5000  # of 1999, before which receivers counted again from 0, and of 2075
 DAY_NS = 86_400 * NS
 SERIAL_DAYS = {"Excel": 25_569, "MATLAB": 719_529}  # days of their calendars at the start of 1970
 FIRST_DAY, LAST_DAY = 10_957, 47_482  # of 2000 and of 2100, since 1970
@@ -50,10 +50,10 @@ def join_gps_weeks(columns: Columns) -> None:
     week, time = columns.values[weeks[0]].astype(np.int64), columns.values[times[0]].astype(float)
     unit = unit_named(columns.units.get(times[0], "")) or spelled[times[0]][1]
     fits = [unit] if unit in USUAL_TIME_NS else units_of_time(float(time[0]), float(np.median(np.diff(time))))
-    if len(week) != len(time) or len(fits) != 1 or not np.isfinite(time).all() or not LEAST_WEEK <= week.min() <= week.max():
+    if len(week) != len(time) or len(fits) != 1 or not np.isfinite(time).all() or not MIN_WEEK <= week.min() <= week.max():
         return
     ns = np.rint(time * USUAL_TIME_NS[fits[0]]).astype(np.int64)
-    if not 0 <= ns.min() <= ns.max() < WEEK_NS or week.max() > MOST_WEEK:
+    if not 0 <= ns.min() <= ns.max() < WEEK_NS or week.max() > MAX_WEEK:
         return
     t_ns, leap_s = gps_times(week, ns)
     for column in (weeks[0], times[0]):
@@ -71,7 +71,7 @@ def read_clocks_and_days(columns: Columns) -> None:
     for column, values in columns.values.items():
         name, unit = name_and_unit(column, columns.units.get(column, ""))
         is_named = re.search(r"time|date|day|stamp|utc|tick", name) or re.fullmatch(TIME_WORDS, name)
-        found = ((t_ns, said) for read, said in NUMBERED if is_named and (t_ns := read(values)) is not None)
+        found = ((t_ns, note) for read, note in NUMBERED if is_named and (t_ns := read(values)) is not None)
         if numbered := next(found, None):
             columns.values[column], columns.units[column] = numbered[0], "ns"
             columns.texts.pop(column, None)
@@ -186,7 +186,7 @@ def counters_of(columns: Columns, length: int) -> list[str]:
         if values.dtype.kind in "iu" and len(values) == length > 1:
             steps = np.diff(unwrapped(values))
             regular = np.mean(steps == np.median(steps)) > 0.5 or re.search(COUNTER, column, re.IGNORECASE)
-            if 1.0 <= np.median(steps) <= MOST_STEP and regular:
+            if 1.0 <= np.median(steps) <= MAX_STEP and regular:
                 found.append(column)
     return sorted(found, key=lambda column: re.fullmatch(r"column \d+", column) is not None)
 
@@ -194,7 +194,7 @@ def counters_of(columns: Columns, length: int) -> list[str]:
 def counts_others(values: np.ndarray) -> bool:
     """Whether a counter numbers other packets, too: steps are no multiples of the usual."""
     steps = np.diff(unwrapped(values))
-    return float(np.mean(steps % max(float(np.median(steps)), 1.0) != 0.0)) > MOST_ODD
+    return float(np.mean(steps % max(float(np.median(steps)), 1.0) != 0.0)) > MAX_ODD
 
 
 def is_counter(name: str) -> bool:
@@ -205,8 +205,8 @@ def is_counter(name: str) -> bool:
 def said_steps(values: np.ndarray) -> str:
     """Shares of the most frequent steps of a counter, in words."""
     steps, counts = np.unique(np.diff(unwrapped(values)), return_counts=True)
-    most = np.argsort(-counts, kind="stable")[:3]
-    return ", ".join(f"{100.0 * counts[n] / counts.sum():.0f} % of its steps are {steps[n]:g}" for n in most)
+    maximum = np.argsort(-counts, kind="stable")[:3]
+    return ", ".join(f"{100.0 * counts[n] / counts.sum():.0f} % of its steps are {steps[n]:g}" for n in maximum)
 
 
 def share_skipped(values: np.ndarray) -> float:

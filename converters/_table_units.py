@@ -31,9 +31,9 @@ UNITS_OF: dict[str, dict[str, float]] = {
 GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gravity
 # of the median length: a tenth of the lengths and the mean vector lie below both in 9 tables of user or linear acceleration,
 # and above one of them in 70 tables of accelerometers on phones, boards and drones
-MOST_TENTH, MOST_MEAN = 0.6, 0.6
-MOST_OF_GRAVITY = 2.0  # factor between gravity and the median acceleration of a robot or a person that moves
-LEAST_HZ, MOST_HZ = 0.2, 50_000.0  # of samples; another unit of the time is a factor of 1000 away
+MAX_TENTH, MAX_MEAN = 0.6, 0.6
+MAX_OF_GRAVITY = 2.0  # factor between gravity and the median acceleration of a robot or a person that moves
+MIN_HZ, MAX_HZ = 0.2, 50_000.0  # of samples; another unit of the time is a factor of 1000 away
 FULL_SCALE_RAD_S = 35.0  # 2000 degrees a second, the widest range of common gyros
 USUAL_SHARE = 0.99  # of the samples: single spikes show no unit
 COUNTS_A_G = {2: 16384, 4: 8192, 8: 4096, 16: 2048}  # by the range in g, of 16 bits
@@ -56,18 +56,18 @@ def is_motion_alone(columns: Columns, chosen: Sequence[str]) -> bool:
     level = _usual(lengths, 0.5)
     if not level > 0.0:
         return False
-    return _usual(lengths, 0.1) < MOST_TENTH * level and float(np.linalg.norm(values.mean(axis=0))) < MOST_MEAN * level
+    return _usual(lengths, 0.1) < MAX_TENTH * level and float(np.linalg.norm(values.mean(axis=0))) < MAX_MEAN * level
 
 
 def unit_doubts(imu: Imu, gyro_unit: str, accel_unit: str) -> list[str]:
     """Doubts about units: by the rate, gravity's size and turns, and the gyros' range."""
     if not len(imu):
         return []
-    doubts, rate_hz = [], 1e9 / float(np.median(np.diff(imu.t_ns))) if len(imu) > 1 else LEAST_HZ
-    if not LEAST_HZ <= rate_hz <= MOST_HZ:
+    doubts, rate_hz = [], 1e9 / float(np.median(np.diff(imu.t_ns))) if len(imu) > 1 else MIN_HZ
+    if not MIN_HZ <= rate_hz <= MAX_HZ:
         doubts.append(f"it has {rate_hz:.3g} samples a second, which no IMU has: is the unit of the time right?")
     level = _usual(np.linalg.norm(imu.accel, axis=1), 0.5)
-    if np.isfinite(level) and not 1.0 / MOST_OF_GRAVITY < level / GRAVITY_M_S2 < MOST_OF_GRAVITY:
+    if np.isfinite(level) and not 1.0 / MAX_OF_GRAVITY < level / GRAVITY_M_S2 < MAX_OF_GRAVITY:
         doubts.append(
             f"the median acceleration is {level:.3g} m/s^2 with accel_unit {accel_unit!r}, and gravity is {GRAVITY_M_S2}:"
             " is the unit right, and are these the columns of the accelerometer?"

@@ -37,7 +37,7 @@ from ._table_packed import is_packed_alone, pieces, table_name
 
 logger = logging.getLogger(__package__)
 TAR = ".tar"  # in .xz, .bz2 or .zst; a .tar.gz is an archive itself
-MOST_NESTED = 3  # archives in archives
+MAX_NESTED = 3  # archives in archives
 SHARE = 2  # at most one part in two of the free disk: the log needs its place, too
 ENCRYPTED = 1  # bit of a zip member's flags
 
@@ -129,7 +129,7 @@ def _place(path: Path) -> str:
 
 def _unpack_nested(found: Unpacked) -> None:
     """Unpack what is packed in packed files, each in its place."""
-    for _ in range(MOST_NESTED):
+    for _ in range(MAX_NESTED):
         for path in _packed_below(found.content):
             place = path.with_name(_place(path) + "_" * (_place(path) == path.name))
             found.enter(path, str(path.relative_to(found.content)), place)
@@ -154,9 +154,9 @@ def _unpack_archive(source: Path, folder: Path) -> Path:
     wanted = {name for name in sizes if not any(part.startswith((".", "__MACOSX")) for part in name.split("/"))}
     with refusing(source):
         folder.mkdir(parents=True)
-        total, most = sum(sizes[name] for name in wanted), _room(folder)
-        if total > most:
-            raise _too_large(source, f"unpacks to {total} bytes", most)
+        total, maximum = sum(sizes[name] for name in wanted), _room(folder)
+        if total > maximum:
+            raise _too_large(source, f"unpacks to {total} bytes", maximum)
         for name, file in _zip_files(source) if is_zip(source) else _tar_files(source):
             if name in wanted:
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -206,6 +206,6 @@ def _room(folder: Path) -> int:
         return shutil.disk_usage(folder).free // SHARE
 
 
-def _too_large(source: Path, what: str, most: int) -> DataError:
-    expected = f"at most {most}, half of the free disk beside the target"
+def _too_large(source: Path, what: str, maximum: int) -> DataError:
+    expected = f"at most {maximum}, half of the free disk beside the target"
     return DataError(what, where=source, expected=expected, fix="Choose an `out` on a larger disk, or unpack it there yourself")

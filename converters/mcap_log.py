@@ -27,7 +27,7 @@ GENERAL = True
 IMUS = r"sensor_msgs/msg/Imu|px4_msgs/msg/(Sensor|Vehicle).*"  # PX4 has parts of an IMU in messages of their own
 METADATA = "metadata.yaml"  # of a ROS 2 bag, which its recorder writes last
 PART = r"(.*)_(\d+)"  # name of a part of a ROS 2 bag
-MOST_PAUSE_NS = 10 * 10**9  # between the parts of one recording, which a recorder splits as it goes
+MAX_PAUSE_NS = 10 * 10**9  # between the parts of one recording, which a recorder splits as it goes
 Define = Callable[[MessageTopic], MessageTopic]
 IMAGES = r"(sensor_msgs/(msg/)?|foxglove\.)(CompressedImage|Image|RawImage)"
 
@@ -139,7 +139,7 @@ def parts(sequence: Sequence) -> list[Path]:
         return []
     spans = map(_span, found) if len(found) > 1 else ()
     gaps = (after[0] - before[1] for before, after in pairwise(spans) if before and after)
-    return found if all(abs(gap) < MOST_PAUSE_NS for gap in gaps) else []
+    return found if all(abs(gap) < MAX_PAUSE_NS for gap in gaps) else []
 
 
 def is_bag_folder(folder: Path) -> bool:

@@ -195,14 +195,14 @@ def _misleads(folder: Path, remarks: Remarks) -> bool:
     """Whether metadata.yaml names no storage, or files that are not there, but others are; fewer than it names are a loss."""
     text, named = _text(folder), _named(folder)
     missing = [name for name in named if not (folder / name).exists()]
-    there = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in (".db3", ".mcap"))
-    if there and not any(re.search(STATED.format(key), text) for key in ("storage_identifier", "compression_format")):
-        remarks.notes.append(f"{METADATA} names no storage, so its files {', '.join(there)} were read one by one")
+    present = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in (".db3", ".mcap"))
+    if present and not any(re.search(STATED.format(key), text) for key in ("storage_identifier", "compression_format")):
+        remarks.notes.append(f"{METADATA} names no storage, so its files {', '.join(present)} were read one by one")
         return True
-    if not missing or not there:
+    if not missing or not present:
         return False
-    said = f"{METADATA} names {', '.join(missing)}, which the folder lacks; its files {', '.join(there)} were read instead"
-    (remarks.notes if len(there) >= len(named) else remarks.losses).append(said)
+    note = f"{METADATA} names {', '.join(missing)}, which the folder lacks; its files {', '.join(present)} were read instead"
+    (remarks.notes if len(present) >= len(named) else remarks.losses).append(note)
     return True
 
 

@@ -41,7 +41,7 @@ PLACE = r"/?(meta/|oxts/(data/)?)?[^/]+$"  # of a file below the folder of its r
 HIDDEN = r"(^|/)(__MACOSX/|\.)"
 NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 FIX = "Record the acceleration with gravity, or gravity too"
-LEAST_GRAVITY, MOST_IN_G = 0.5, 2.0  # median lengths, in m/s² of nothing but motion, and of readings in g
+MIN_GRAVITY, MAX_IN_G = 0.5, 2.0  # median lengths, in m/s² of nothing but motion, and of readings in g
 
 
 @dataclass(frozen=True)
@@ -150,13 +150,13 @@ def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str,
     accel_ns, accel, used = _acceleration(files, tables, clock, where, remarks)
     level = float(np.median(np.linalg.norm(accel, axis=1)))
     is_alone = used == ("accelerometer",) and "seconds_elapsed" in files.text(tables["accelerometer"]).partition("\n")[0]
-    if level <= LEAST_GRAVITY or (is_alone and abs(level / STANDARD_GRAVITY - 1.0) > GRAVITY_BAND):
+    if level <= MIN_GRAVITY or (is_alone and abs(level / STANDARD_GRAVITY - 1.0) > GRAVITY_BAND):
         raise DataError(f"the median acceleration is {level:.3g} m/s^2: gravity was taken out", where=where, fix=FIX)
     if is_alone and (steady := _steady_level(accel_ns, accel)) < STANDARD_GRAVITY / 2.0:
         raise DataError(
             f"the acceleration cancels out to {steady:.3g} m/s^2 in a second: gravity was taken out", where=where, fix=FIX
         )
-    if in_g := level < MOST_IN_G:
+    if in_g := level < MAX_IN_G:
         accel = accel * STANDARD_GRAVITY
         remarks.notes.append(f"the median acceleration is {level:.3g}: it was taken for g, and is now m/s^2")
     if _is_ios(files) or (in_g and "accelerometeruncalibrated" in used):  # where Sensor Logger writes g on no other system
@@ -168,8 +168,8 @@ def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str,
     imu = _in_rad_s(imu, _stated_unit(files, tables[gyro_table]), remarks)
     scalars: dict[str, Scalars] = {}
     if others := [path for table, path in tables.items() if re.fullmatch(rf"({'|'.join(GYRO)})\d+", table)]:
-        said = f"{', '.join(others)} of further gyroscopes or recordings become numbers and no IMU"
-        remarks.notes.append(f"{said}: give each a folder of its own, with its accelerometer")
+        note = f"{', '.join(others)} of further gyroscopes or recordings become numbers and no IMU"
+        remarks.notes.append(f"{note}: give each a folder of its own, with its accelerometer")
     for table, path in tables.items():
         if table not in (gyro_table, *used):
             scalars |= _others(files, path, clock, where, remarks)
@@ -246,7 +246,7 @@ def _columns(
 ) -> tuple[Int64[np.ndarray, " n"], dict[str, tuple[Float64[np.ndarray, " n"], str]]]:
     """Times of a table, and its other columns with their units, by plain names."""
     columns = Columns()
-    read_csv(files.text(path), columns, Path(f"{where}/{path}"), least=2)
+    read_csv(files.text(path), columns, Path(f"{where}/{path}"), minimum=2)
     remarks.notes.extend(columns.remarks.notes)
     remarks.losses.extend(f"{path}: {loss}" for loss in columns.remarks.losses)
     named = {split_name(column): column for column in columns.values}

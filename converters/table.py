@@ -26,7 +26,7 @@ from ._source import head, name
 from ._table_dates import said_epoch
 from ._table_files import kind_of, load
 from ._table_folder import load_split, sequences_below
-from ._table_groups import MOST_CONSTANTS, group_entries, imus_apart, pose_clock, shared_group, time_beside, turned
+from ._table_groups import MAX_CONSTANTS, group_entries, imus_apart, pose_clock, shared_group, time_beside, turned
 from ._table_layouts import known_layout
 from ._table_map import (
     IMU_TOPIC,
@@ -57,8 +57,8 @@ from ._table_units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
 
 unpacked = _unpacking.unpacked  # `convert` asks for it where no converter reads a source as it is
 GENERAL = True
-MOST_SCALARS = 200  # further columns that become topics
-MOST_LOSSES = 8  # in a refusal
+MAX_SCALARS = 200  # further columns that become topics
+MAX_LOSSES = 8  # in a refusal
 POSES_TOPIC = "/ground_truth/pose"
 
 
@@ -130,8 +130,8 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks, given: Entries) ->
     Raises:
         ConfigError: something is open; the message holds a map file to complete.
     """
-    apart = {} if known_layout(columns) or given.keys() & {"gyro", "accel"} else imus_apart(columns)
-    proposals = {topic: _proposal(part, given) for topic, part in (apart or {IMU_TOPIC: columns}).items()}
+    separate = {} if known_layout(columns) or given.keys() & {"gyro", "accel"} else imus_apart(columns)
+    proposals = {topic: _proposal(part, given) for topic, part in (separate or {IMU_TOPIC: columns}).items()}
     share_units(proposals.values())
     proposals = without_copies(proposals, columns)
     own_times = len({str(proposal.entries.get("time", "")) for proposal in proposals.values()}) > 1
@@ -139,18 +139,18 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks, given: Entries) ->
     for topic, proposal in proposals.items():
         if proposal.open:
             names = ", ".join([column for column in columns.values if not column.startswith(COUNTED)][:40])
-            more = f"; and {len(remarks.losses) - MOST_LOSSES} more losses" if len(remarks.losses) > MOST_LOSSES else ""
-            reasons = "; ".join(proposal.reasons + remarks.losses[:MOST_LOSSES]) + more
+            more = f"; and {len(remarks.losses) - MAX_LOSSES} more losses" if len(remarks.losses) > MAX_LOSSES else ""
+            reasons = "; ".join(proposal.reasons + remarks.losses[:MAX_LOSSES]) + more
             raise ConfigError(
                 f"the meaning of its columns is not certain: {reasons}. Its columns are {names}",
                 where=path,
                 fix=f"Give as `mapping` {proposal.in_words()}this file, completed:\n\n"
-                f"{proposal.toml([*apart], own_times=own_times)}",
+                f"{proposal.toml([*separate], own_times=own_times)}",
             )
         named = {key: ", ".join(map(str, np.atleast_1d(value))) for key, value in proposal.entries.items()}
         shown = [key for key in named if not named.get(key.removesuffix("_unit"), "").startswith(COUNTED)]
-        said = "columns: " + "; ".join(f"{key} = {named[key]}" for key in shown)
-        remarks.notes.extend(f"{topic}: {note}" if apart else note for note in (said, *proposal.reasons))
+        text = "columns: " + "; ".join(f"{key} = {named[key]}" for key in shown)
+        remarks.notes.extend(f"{topic}: {note}" if separate else note for note in (text, *proposal.reasons))
         maps.append(msgspec.convert({"topic": topic, **proposal.entries, "rate_hz": proposal.rate_hz}, TableMap))
     return maps
 
@@ -263,29 +263,29 @@ def _further(
 ) -> tuple[dict[str, Scalars], dict[str, str]]:
     """Further columns as topics, on the clock of their group or on an IMU's, and short ones without time as texts."""
     times = [(each, times_named(columns, each.time, each.time_unit, where)) for each in tables]
-    constants, left, clocks, apart = {}, [], dict[str, Int64[np.ndarray, " n"]](), dict[str, list[str]]()
+    constants, numbers, clocks, separate = {}, [], dict[str, Int64[np.ndarray, " n"]](), dict[str, list[str]]()
     for column in [c for c in columns.values if c not in used]:
         table, t_ns = max(times, key=lambda each: shared_group(each[0].time, column))
-        beside = time_beside(columns, column, table.time, table.time_unit, apart=True)
+        beside = time_beside(columns, column, table.time, table.time_unit, separate=True)
         if beside is not None:
             if beside[0] != column:
                 clocks[column] = own_ns = times_named(columns, *beside, where)
                 if own_ns[0] > t_ns[-1] or own_ns[-1] < t_ns[0]:
-                    apart.setdefault(f"{beside[0]} (in {beside[1]})", []).append(column)
+                    separate.setdefault(f"{beside[0]} (in {beside[1]})", []).append(column)
         elif len(columns.values[column]) == len(t_ns):
             clocks[column] = t_ns
-        elif len(columns.values[column]) <= MOST_CONSTANTS:
+        elif len(columns.values[column]) <= MAX_CONSTANTS:
             constants[column] = str(columns.values[column].tolist())
         else:
-            left.append(column)
-    notes = (f"{clock} stays apart from the IMU's clock: {', '.join(names[:20])}" for clock, names in apart.items())
+            numbers.append(column)
+    notes = (f"{clock} stays apart from the IMU's clock: {', '.join(names[:20])}" for clock, names in separate.items())
     columns.remarks.notes.extend(notes)
-    if left:
-        columns.remarks.losses.append(f"columns of another length, without a time, are left out: {', '.join(left[:20])}")
-    if (over := len(clocks) - MOST_SCALARS) > 0:
+    if numbers:
+        columns.remarks.losses.append(f"columns of another length, without a time, are left out: {', '.join(numbers[:20])}")
+    if (over := len(clocks) - MAX_SCALARS) > 0:
         columns.remarks.losses.append(f"the table has {len(clocks)} further columns: {over} of them are left out")
     scalars: dict[str, Scalars] = {}
-    for column, times_ns in list(clocks.items())[:MOST_SCALARS]:
+    for column, times_ns in list(clocks.items())[:MAX_SCALARS]:
         kept = in_order(times_ns, columns.values[column].astype(np.float64)[:, None], column)
         if len(kept.t_ns):
             unit = re.search(r"[\[(]([^\])]*)[\])]\s*$", column)

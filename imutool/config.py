@@ -32,8 +32,8 @@ WORDS = {
     "object": "a table",
     "null": "nothing",
 }
-MOST_NESTED = 32  # tables and lists in each other; ours have five
-MOST_BYTES = 1 << 20  # of a TOML file: a physics.toml of twenty curves has 50 kB, and a megabyte takes a second to parse
+MAX_NESTED = 32  # tables and lists in each other; ours have five
+MAX_BYTES = 1 << 20  # of a TOML file: a physics.toml of twenty curves has 50 kB, and a megabyte takes a second to parse
 
 
 def load(cls: type[S], path: Path | None = None, overrides: Iterable[str] = ()) -> S:
@@ -66,12 +66,12 @@ def toml(path: Path, what: str) -> dict[str, Any]:
     """
     try:
         with path.open("rb") as file:
-            raw = file.read(MOST_BYTES + 1)
-        if len(raw) > MOST_BYTES:
+            raw = file.read(MAX_BYTES + 1)
+        if len(raw) > MAX_BYTES:
             raise ConfigError(
-                f"{what} cannot be read (more than {MOST_BYTES} bytes)",
+                f"{what} cannot be read (more than {MAX_BYTES} bytes)",
                 where=path,
-                expected=f"a TOML file of at most {MOST_BYTES} bytes",
+                expected=f"a TOML file of at most {MAX_BYTES} bytes",
                 fix="Check the name of the file",
             )
         values = tomllib.loads(raw.decode())
@@ -89,12 +89,12 @@ def toml(path: Path, what: str) -> dict[str, Any]:
 def _refuse_nested(values: dict[str, Any], where: str | Path | None, what: str) -> None:
     """Refuse tables and lists deeper than any setting, which later steps could not walk through."""
     level: list[Any] = [values]
-    for _ in range(MOST_NESTED):
+    for _ in range(MAX_NESTED):
         inner = [list(value.values()) if isinstance(value, dict) else value for value in level]
         level = [value for items in inner for value in items if isinstance(value, dict | list)]
         if not level:
             return
-    raise ConfigError(f"{what} cannot be read ({NESTED})", where=where, expected=f"at most {MOST_NESTED} tables in each other")
+    raise ConfigError(f"{what} cannot be read ({NESTED})", where=where, expected=f"at most {MAX_NESTED} tables in each other")
 
 
 def build(cls: type[S], values: dict[str, Any], where: str | Path | None = None) -> S:
@@ -112,9 +112,9 @@ def build(cls: type[S], values: dict[str, Any], where: str | Path | None = None)
         raise _of_value(str(error), where) from error
 
 
-def _of_value(said: str, where: str | Path | None) -> ConfigError:
+def _of_value(reason: str, where: str | Path | None) -> ConfigError:
     """Error of msgspec in our words: the setting, what it is, and what was expected."""
-    what, _, place = said.rstrip(".").removesuffix(" - at `$`").partition(" - at `$.")
+    what, _, place = reason.rstrip(".").removesuffix(" - at `$`").partition(" - at `$.")
     place = place.rstrip("`")
     expected, got = "", ""
     if what.startswith("Expected "):
@@ -145,7 +145,7 @@ def _put(values: dict[str, Any], word: str, parameter: str) -> None:
     except (ValueError, RecursionError):  # no TOML, more than one line of it, or nested too deeply to be any setting's
         value = text
     *tables, last = key.split(".")
-    if len(tables) > MOST_NESTED:
+    if len(tables) > MAX_NESTED:
         raise ConfigError(f"the key has {len(tables)} dots", where=parameter, expected="the name of a setting")
     for table in tables:
         values = values.setdefault(table, {})

@@ -265,8 +265,8 @@ def _debias(
             entries = {_record_name("imutool", t, records): v | origin | sieves[t].record() for t, v in records.items()}
             return entries | {_record_name(CLEAN_RECORD, topic, records): found.record() for topic, found in surveys.items()}
 
-        ways = {"overwrite": options.overwrite, "own_encoding": options.encoding == "own"}
-        report = rewrite(log, target, derived, metadata=metadata, check=options.check, progress=progress, **ways)
+        writing = {"overwrite": options.overwrite, "own_encoding": options.encoding == "own"}
+        report = rewrite(log, target, derived, metadata=metadata, check=options.check, progress=progress, **writing)
     for topic, sieve in sieves.items():
         for text in sieve.warnings():
             logger.warning("%s %s: %s", source, topic, text)

@@ -198,10 +198,10 @@ def _closed(
     log = folder / CLOSED_LOG
     for number in range(1, ROUNDS + 1):
         simulated(log, physics=folder / EFFECT, overwrite=overwrite or number > 1)
-        again = against(log)
-        if number == ROUNDS or not is_worth_a_round(first, again):
+        second = against(log)
+        if number == ROUNDS or not is_worth_a_round(first, second):
             break
-        better = search(begin=(*first.findings, *again.findings))
+        better = search(begin=(*first.findings, *second.findings))
         if {finding.effect for finding in better.findings} == {finding.effect for finding in first.findings}:
             break
         rewrite(first := better)
@@ -209,13 +209,13 @@ def _closed(
         figures = None if metric is None else (metric[1], figure(metric[0], log))
     except ImutoolError as error:  # for a figure no diagnosis is thrown away
         figures, first = None, replace(first, remarks=(*first.remarks, f"The metric is not compared: {error}"))
-    done = replace(first, closed=closed_loop(first, again, log, metric=figures, rounds=number))
+    done = replace(first, closed=closed_loop(first, second, log, metric=figures, rounds=number))
     with Target(folder / FINDINGS, overwrite=True) as findings:
         findings.write(json_text(done.report).encode())
     if find_spec("matplotlib") is not None:
         from imutool.viewing.html.diagnosis_page import write as write_page
 
-        write_page(again, folder / CLOSED, logs=LOG if (folder / LOG).exists() else None, first=done)
+        write_page(second, folder / CLOSED, logs=LOG if (folder / LOG).exists() else None, first=done)
     return done
 
 

@@ -41,7 +41,7 @@ logger = logging.getLogger(__name__)
 RAW, TRUTH = "raw", "truth"  # also of files of trajectories
 DRIFT_S = 5.0
 DELAY_WINDOW_S = 1.0  # of the windows that show a delay of the poses
-CLEAR_STDS, MOST_DRIFT_LEFT = 4.0, 0.9  # of a clear delay: deviations, and share of the drift that is left without it
+CLEAR_STDS, MAX_DRIFT_LEFT = 4.0, 0.9  # of a clear delay: deviations, and share of the drift that is left without it
 DRIFTS = "drift_orientation_deg", "drift_velocity_m_s", "drift_orientation_std_deg", "drift_velocity_std_m_s"
 DELAY = "pose_delay_s", "pose_delay_std_s", "aoe_without_delay_deg", "drift_orientation_without_delay_deg"
 PURE, AIDED = "integration", "aided"
@@ -215,14 +215,14 @@ def _without_delay(imu: Imu, span: TrueSpan, recording: Recording, drift_deg: fl
         return nothing
     moved = replace(recording.truth, t_ns=recording.truth.t_ns - nanoseconds(found[0]))
     try:
-        again = TrueSpan(imu.t_ns, moved, recording.name)
+        moved_span = TrueSpan(imu.t_ns, moved, recording.name)
     except DataError:
         return nothing
-    samples = imu.rows(again.span)
-    left_deg = _drift(samples, again, None, None, samples)[DRIFTS[0]]
-    if left_deg is None or not left_deg < MOST_DRIFT_LEFT * drift_deg:
+    samples = imu.rows(moved_span.span)
+    left_deg = _drift(samples, moved_span, None, None, samples)[DRIFTS[0]]
+    if left_deg is None or not left_deg < MAX_DRIFT_LEFT * drift_deg:
         return nothing
-    aoe_deg = metrics.absolute_blocks(partial(integrated, samples, again, means=True))["aoe_deg"]
+    aoe_deg = metrics.absolute_blocks(partial(integrated, samples, moved_span, means=True))["aoe_deg"]
     return dict(zip(DELAY, (*found, aoe_deg, left_deg), strict=True))
 
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imutool import registry
-from imutool.config import MOST_BYTES, Settings, build, load, plain
+from imutool.config import MAX_BYTES, Settings, build, load, plain
 from imutool.errors import ConfigError
 from imutool.inertial.stationary import StationarySettings
 from imutool.noise.datasheet import read as read_noise
@@ -126,7 +126,7 @@ def test_a_file_too_large_or_nested_without_end_is_refused_before_it_costs_anyth
     path = tmp_path / "huge.toml"
     with path.open("wb") as file:
         file.truncate(1 << 40)  # a terabyte that takes no room
-    with pytest.raises(ConfigError, match=rf"huge.toml: .* cannot be read \(more than {MOST_BYTES} bytes\); expected"):
+    with pytest.raises(ConfigError, match=rf"huge.toml: .* cannot be read \(more than {MAX_BYTES} bytes\); expected"):
         read(path)
     path.write_text("a = " + "[" * 100_000)
     with pytest.raises(ConfigError, match="nested too deeply"):

@@ -59,7 +59,7 @@ def test_every_command_and_option_stands_in_the_reference(site: Path) -> None:
 def test_every_setting_stands_in_the_reference_with_its_meaning(site: Path) -> None:
     page = (site / "reference" / "settings.html").read_text(encoding="utf-8")
     rows = re.findall(r"<tr>\s*<td><code>(.*?)</code></td>\s*<td>.*?</td>\s*<td>(.*?)</td>\s*</tr>", page, re.DOTALL)
-    assert {"steps", "paper.gyro_steps", "ode.drift_step_s", "search.most_effects", "smoother.lag_s"} <= dict(rows).keys()
+    assert {"steps", "paper.gyro_steps", "ode.drift_step_s", "search.max_effects", "smoother.lag_s"} <= dict(rows).keys()
     assert [key for key, meaning in rows if not meaning] == []
 
 

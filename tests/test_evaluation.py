@@ -21,7 +21,7 @@ from imutool import evaluation
 from imutool.bias import linear
 from imutool.bias.model_file import find_model, save
 from imutool.bias_start.correction import apply_with_std
-from imutool.bias_start.initial_bias import LEAST_STD
+from imutool.bias_start.initial_bias import MIN_STD
 from imutool.bias_start.model_choice import find_initial_bias
 from imutool.bias_start.prior_width import BiasPrior
 from imutool.cli import load
@@ -315,8 +315,8 @@ def test_what_tracking_found_out_narrows_the_prior_of_an_aided_path(
     evaluate(log, models=[model], aid="stops")
     raw, known = (prior.std for prior in priors)
     _, std = apply_with_std(loaded, start, recording.imu)
-    assert (known <= np.maximum(start.std, LEAST_STD)).all()
-    np.testing.assert_allclose(known, np.maximum(np.minimum(start.std, np.median(std, axis=0)), LEAST_STD), rtol=1e-12)
+    assert (known <= np.maximum(start.std, MIN_STD)).all()
+    np.testing.assert_allclose(known, np.maximum(np.minimum(start.std, np.median(std, axis=0)), MIN_STD), rtol=1e-12)
     assert (known < start.std).any()
     assert (raw > known)[:3].all()
 

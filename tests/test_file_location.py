@@ -34,7 +34,7 @@ from imutool.mcap_io.write import write
 from imutool.recording import Frames, Imu, Recording
 
 MIB = 1 << 20
-LEAST_PART = 5 * MIB  # S3 takes no smaller ones, but for the last
+MIN_PART = 5 * MIB  # S3 takes no smaller ones, but for the last
 
 # ── what a user names ──
 
@@ -162,7 +162,7 @@ def test_a_key_that_is_taken_is_refused_without_overwrite(store: Any, flight: by
 
 def test_a_large_object_goes_up_in_parts_and_comes_back(store: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     data = bytes(range(256)) * (11 * MIB // 256)
-    monkeypatch.setattr(upload, "PART_BYTES", LEAST_PART)
+    monkeypatch.setattr(upload, "PART_BYTES", MIN_PART)
     with Target(to_location("s3://fleet/large")) as target:
         for at in range(0, len(data), MIB):
             target.write(data[at : at + MIB])
@@ -176,8 +176,8 @@ def test_a_large_object_goes_up_in_parts_and_comes_back(store: Any, monkeypatch:
 
 
 def test_parts_grow_so_that_there_are_never_too_many_of_them(store: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(upload, "PART_BYTES", LEAST_PART)
-    monkeypatch.setattr(upload, "LARGE_AFTER", LEAST_PART)
+    monkeypatch.setattr(upload, "PART_BYTES", MIN_PART)
+    monkeypatch.setattr(upload, "LARGE_AFTER", MIN_PART)
     monkeypatch.setattr(upload, "LARGE_PART_BYTES", 8 * MIB)
     filled("s3://fleet/large", 22, MIB)
     assert sum("partNumber" in request.query for request in store.requests) == 4  # of 5, 8, 8 and 1 MiB
@@ -204,7 +204,7 @@ def test_an_upload_that_is_given_up_leaves_neither_parts_nor_objects(
         assert (store.keys() if complete else store.uploads()) == [target.temporary.name]
         raise error
 
-    monkeypatch.setattr(upload, "PART_BYTES", LEAST_PART)
+    monkeypatch.setattr(upload, "PART_BYTES", MIN_PART)
     with pytest.raises(type(error)):
         filled("s3://fleet/out", 1, 6 * MIB, give_up)
     assert (store.uploads(), store.keys()) == ([], [])
@@ -385,7 +385,7 @@ def test_a_store_that_fails_for_good_while_a_log_is_read_is_said_and_nothing_is_
 def test_a_store_that_fails_for_good_while_a_log_is_written_is_said_and_nothing_is_left(
     store: Any, monkeypatch: pytest.MonkeyPatch, wanted: Any, how: str
 ) -> None:
-    monkeypatch.setattr(upload, "PART_BYTES", LEAST_PART)
+    monkeypatch.setattr(upload, "PART_BYTES", MIN_PART)
     store.fault = failing(wanted, how)
     with pytest.raises(ConfigError, match=r"s3://fleet/large: cannot be written \(.+\)") as raised:
         filled("s3://fleet/large", 2, 6 * MIB)

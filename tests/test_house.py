@@ -167,7 +167,7 @@ def test_no_room_is_a_drawer() -> None:
 
 # ── the size of rooms, files and functions ──
 
-MOST_MODULES, MOST_LINES, MOST_FUNCTION_LINES, MEDIAN_FUNCTION_LINES = 12, 300, 60, 7
+MAX_MODULES, MAX_LINES, MAX_FUNCTION_LINES, MEDIAN_FUNCTION_LINES = 12, 300, 60, 7
 CATALOGUES = {"imutool.cleaning.rules", "imutool.cli", "imutool.converters", "imutool.sensor.effects"}  # a file is an entry
 
 
@@ -189,19 +189,17 @@ def lines_of(node: ast.FunctionDef) -> int:
 
 def test_a_room_has_at_most_a_dozen_modules() -> None:
     modules_in = {room: [n for n in names if n not in folders()] for room, names in folders().items()}
-    assert {
-        room: len(names) for room, names in modules_in.items() if len(names) > MOST_MODULES and room not in CATALOGUES
-    } == {}
+    assert {room: len(names) for room, names in modules_in.items() if len(names) > MAX_MODULES and room not in CATALOGUES} == {}
 
 
 def test_no_file_is_longer_than_a_reader_likes() -> None:
     sizes = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in SOURCES}
-    assert {str(path.relative_to(ROOT)): size for path, size in sizes.items() if size > MOST_LINES} == {}
+    assert {str(path.relative_to(ROOT)): size for path, size in sizes.items() if size > MAX_LINES} == {}
 
 
 def test_functions_are_short() -> None:
     sizes = [(f"{name}.{node.name}", lines_of(node)) for name, tree in everything().items() for node in functions(tree)]
-    assert [(name, size) for name, size in sizes if size > MOST_FUNCTION_LINES] == []
+    assert [(name, size) for name, size in sizes if size > MAX_FUNCTION_LINES] == []
     assert statistics.median(size for _, size in sizes) <= MEDIAN_FUNCTION_LINES
 
 
@@ -285,6 +283,34 @@ def test_what_is_public_is_documented() -> None:
 
     assert imutool.__all__ == sorted(imutool.__all__)
     assert [name for name in imutool.__all__ if not (getattr(imutool, name).__doc__ or "").strip()] == []
+
+
+FIGURES_OF_SPEECH = {
+    "again",
+    "apart",
+    "course",
+    "faint",
+    "felt",
+    "held",
+    "here",
+    "least",
+    "mine",
+    "most",
+    "one",
+    "said",
+    "theirs",
+}
+FIGURES_OF_SPEECH |= {"there", "thin", "this", "told", "untold", "ways"}
+
+
+def test_no_local_name_is_a_figure_of_speech() -> None:
+    found = []
+    for name, tree in everything().items():
+        for function in functions(tree):
+            arguments = [argument.arg for argument in nodes(function) if isinstance(argument, ast.arg)]
+            local = [node.id for node in nodes(function) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)]
+            found += [f"{name}.{function.name}: {word}" for word in [*arguments, *local] if word in FIGURES_OF_SPEECH]
+    assert found == []
 
 
 PRIVATE_PHRASES = ("what is told", "what is said", "is had", "cannot be had", "nothing of it", "is no longer told")

@@ -88,7 +88,7 @@ def checked(function: Function) -> Function:
 
 @contextmanager
 def given_logs(
-    logs: LogPath | Recording | Iterable[LogPath | Recording], parameter: str, *, least: int = 1
+    logs: LogPath | Recording | Iterable[LogPath | Recording], parameter: str, *, minimum: int = 1
 ) -> Iterator[GivenLogs]:
     """Files or objects of one log or several; a recording is a file while they are used.
 
@@ -117,7 +117,7 @@ def given_logs(
                 write(log, places[-1])
             else:
                 places.append(location(log))
-        if len(places) < least:
+        if len(places) < minimum:
             raise ConfigError("no log is given", where=parameter, expected="one or more")
         refuse_twins(places, parameter)
         try:

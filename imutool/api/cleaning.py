@@ -151,9 +151,9 @@ def repair(
         (False, True)
     """
     check_outputs([OutputFile("target", target, (*output_conflicts.LOG, ".bag"))], [source], overwrite=overwrite)
-    here, there = location(source), location(target)
-    if not is_bag(here):
-        return repair_log(here, there, damaged=damaged, max_chunk=max_chunk, overwrite=overwrite, progress=progress)
+    origin, destination = location(source), location(target)
+    if not is_bag(origin):
+        return repair_log(origin, destination, damaged=damaged, max_chunk=max_chunk, overwrite=overwrite, progress=progress)
     if damaged != "drop":
         raise ConfigError(NO_ATTACHMENTS, where="damaged=keep", fix="Leave `damaged` out")
-    return repair_bag(here, there, overwrite=overwrite, progress=progress)
+    return repair_bag(origin, destination, overwrite=overwrite, progress=progress)

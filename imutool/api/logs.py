@@ -149,7 +149,7 @@ def convert(
         ['flight_1.mcap', 'flight_2.mcap']
     """
     check_outputs([OutputFile("out", out, files=("*.mcap",), keeps=True)], [source], overwrite=overwrite)
-    ways: dict[str, Any] = {"compression": compression, "images": images, "overwrite": overwrite, "workers": workers}
+    options: dict[str, Any] = {"compression": compression, "images": images, "overwrite": overwrite, "workers": workers}
     marks: dict[str, Any] = {"sensor": sensor, "kinds": several(kinds), "imu": imu, "fix": fix, "restamp": restamp}
     return conversion.convert(
         local(source, "source"),
@@ -158,7 +158,7 @@ def convert(
         sequences=several(sequences),
         mapping=mapping if mapping is None or isinstance(mapping, Mapping) else local(mapping, "mapping"),
         progress=progress,
-        **ways,
+        **options,
         **marks,
     )
 

@@ -145,7 +145,7 @@ def diagnose(
         ['lever_arm']
     """
     folder = None if output is None else local(output, "output")
-    given = given_logs(reals, "reals"), given_logs([] if sim is None else [sim], "sim", least=0)
+    given = given_logs(reals, "reals"), given_logs([] if sim is None else [sim], "sim", minimum=0)
     with given[0] as logs, given[1] as sims, one_blas_thread():
         inputs = logs.places + sims.places
         check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], inputs, overwrite=overwrite)

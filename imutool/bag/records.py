@@ -209,16 +209,16 @@ def unpack(compression: str, packed: bytes, size: int, *, cut: bool) -> bytes:
         raise LogError(f"it says it unpacks to {size} bytes", expected=f"at most {CHUNK_LIMIT}")
     unpacker = bz2.BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
     parts: list[bytes] = []
-    left, data = size + 1, packed  # a byte more than stated, to notice a longer one
+    remaining, data = size + 1, packed  # a byte more than stated, to notice a longer one
     try:
-        while left and not unpacker.eof and (data or not unpacker.needs_input):
-            parts.append(unpacker.decompress(data, max_length=left))
-            left, data = left - len(parts[-1]), b""
+        while remaining and not unpacker.eof and (data or not unpacker.needs_input):
+            parts.append(unpacker.decompress(data, max_length=remaining))
+            remaining, data = remaining - len(parts[-1]), b""
     except (OSError, ValueError, EOFError, RuntimeError) as error:
         raise LogError(f"it does not unpack ({error})") from error
     if cut:
         return b"".join(parts)[:size]
-    if left != 1 or not unpacker.eof:
+    if remaining != 1 or not unpacker.eof:
         raise LogError(f"it does not unpack to the {size} bytes it says it has")
     return b"".join(parts)
 

@@ -90,12 +90,12 @@ class Bag:
 
     def _head(self, at: int) -> Head | None:
         """The head of the record at a byte of the file."""
-        left = self.source.size - at
-        if left < 8:
+        remaining = self.source.size - at
+        if remaining < 8:
             return None
-        raw = self.source.at(at, min(HEAD_BYTES, left))
+        raw = self.source.at(at, min(HEAD_BYTES, remaining))
         size = int.from_bytes(raw[:4], "little")
-        if size > HEAD_LIMIT or size > left - 8:
+        if size > HEAD_LIMIT or size > remaining - 8:
             return None
         if size + 8 > len(raw):
             raw = self.source.at(at, size + 8)
@@ -178,14 +178,14 @@ class Bag:
 
     def _next_chunk(self, start: int) -> int:
         """Offset of the next chunk or bag at or behind a byte, or the end of the file."""
-        size, (scan, most) = self.source.size, SCAN_BYTES
+        size, (scan, maximum) = self.source.size, SCAN_BYTES
         while start < size:
             raw = self.source.at(start, min(scan + HEAD_BYTES, size - start))
             found = records.next_head(raw, Op.CHUNK, 0)
             nearest = [at for at in (found.at if found else -1, raw.find(MAGIC)) if at >= 0]
             if nearest:
                 return start + min(nearest)
-            start, scan = start + scan, min(2 * scan, most)
+            start, scan = start + scan, min(2 * scan, maximum)
         return size
 
     def _end(self, found: Head) -> int:
@@ -194,10 +194,10 @@ class Bag:
 
     def _is_boundary(self, end: int) -> bool:
         """Whether a record may end there: a record, another bag or the end of the file follows."""
-        left = self.source.size - end
-        if 0 <= left < 8 or (left > 0 and self._head(end) is not None):
+        remaining = self.source.size - end
+        if 0 <= remaining < 8 or (remaining > 0 and self._head(end) is not None):
             return True
-        return left >= len(MAGIC) and self.source.at(end, len(MAGIC)) == MAGIC
+        return remaining >= len(MAGIC) and self.source.at(end, len(MAGIC)) == MAGIC
 
     def _chunk(self, found: Head, end: int) -> Chunk:
         """The readable part of a chunk; all its damage is one loss."""
@@ -280,8 +280,8 @@ class _ChunkScan:
 
     def _cut(self, position: int) -> bool:
         """Whether the chunk was cut off inside the head at `position`."""
-        left = len(self.data) - position
-        return self.loose and 0 < left < HEAD_BYTES and records.next_head(self.data, Op.MESSAGE, position) is None
+        remaining = len(self.data) - position
+        return self.loose and 0 < remaining < HEAD_BYTES and records.next_head(self.data, Op.MESSAGE, position) is None
 
     def _resume(self, position: int, end: int) -> Head | None:
         """The next message behind damage."""

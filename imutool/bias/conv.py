@@ -126,11 +126,11 @@ class _Stream:
     """Bias stream of both networks."""
 
     def __init__(self, model: Model, rest: Vector6) -> None:
-        self.rest, held = rest.astype(np.float64), model.tensors
-        self.W: Mapping[Sensor, Array] = {sensor: held[f"W.{sensor}"].T.copy() for sensor in SENSORS}
-        self.scale = {sensor: held[f"net.{sensor}.scale"] for sensor in SENSORS}
+        self.rest, tensors = rest.astype(np.float64), model.tensors
+        self.W: Mapping[Sensor, Array] = {sensor: tensors[f"W.{sensor}"].T.copy() for sensor in SENSORS}
+        self.scale = {sensor: tensors[f"net.{sensor}.scale"] for sensor in SENSORS}
         self.layers = {sensor: [_Convolution(layer) for layer in model.folded(sensor)] for sensor in SENSORS}
-        self.out = {sensor: model.config.unit(sensor) * held[f"net.{sensor}.out"].T for sensor in SENSORS}
+        self.out = {sensor: model.config.unit(sensor) * tensors[f"net.{sensor}.out"].T for sensor in SENSORS}
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]

@@ -65,8 +65,8 @@ class Model(BiasModel):
         self.effects = effects or {sensor: forms(sensor, self.config.effects(sensor) or ()) for sensor in SENSORS}
         self.ode: neural_ode.Model | None = None
         if self.config.remainder:
-            held = {name.removeprefix("ode."): value for name, value in self.tensors.items() if name.startswith("ode.")}
-            self.ode = neural_ode.Model(self.config.ode, rate_hz, held)
+            ode_tensors = {name.removeprefix("ode."): value for name, value in self.tensors.items() if name.startswith("ode.")}
+            self.ode = neural_ode.Model(self.config.ode, rate_hz, ode_tensors)
             self.counts_samples = self.ode.counts_samples
 
     @classmethod

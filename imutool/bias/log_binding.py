@@ -19,14 +19,14 @@ from imutool.recording.columns import quantile
 from imutool.sensor.signals import TEMPERATURE_TERMS
 
 RATE_TOLERANCE = 0.05  # a real rate differs from its nominal one by a few per mille (BMI160: 199.4 for 200)
-MOST_FACTOR = 4.5  # between the rates of training and log: four, as means of four samples were tried, and some drift
+MAX_FACTOR = 4.5  # between the rates of training and log: four, as means of four samples were tried, and some drift
 BATCHES = "The stamps come in batches: imutool convert LOG OUT --restamp puts them on the clock of the sensor"
-MOST_AGE_S = 60.0  # of a number of the channel: a case warms within minutes
+MAX_AGE_S = 60.0  # of a number of the channel: a case warms within minutes
 SET_BACK = 2  # half seconds: further back the clock was set, and the sample is not late
 WALK_NS = 10_000_000_000  # between two numbers of a drift, from which its walk is taken
-MOST_NOISE = 4.0  # ratio to the residuals of the training logs; training logs up to 2.0
-MOST_RATE, SURE = 2e-3, 3.0  # relative difference of rates: one unit's clock stays within 1e-4; deviations of a median step
-MOST_BEYOND_K = 1.0  # beyond the trained range, before it counts as another one
+MAX_NOISE = 4.0  # ratio to the residuals of the training logs; training logs up to 2.0
+MAX_RATE, SURE = 2e-3, 3.0  # relative difference of rates: one unit's clock stays within 1e-4; deviations of a median step
+MAX_BEYOND_K = 1.0  # beyond the trained range, before it counts as another one
 Rows3 = Float64[np.ndarray, "n 3"]
 Rows6 = Float64[np.ndarray, "n 6"]
 Stamps = Int64[np.ndarray, " n"]
@@ -35,7 +35,7 @@ Stamps = Int64[np.ndarray, " n"]
 def at_rate(model: BiasModel, rate_hz: float, where: object, t_ns: Stamps | None = None, *, force: bool = False) -> BiasModel:
     """Model for samples at a rate; within 5 % of that of its training it is the model itself.
 
-    With `force` another rate may be as far away as `MOST_FACTOR`: filters and drifts have their times in seconds. The times of
+    With `force` another rate may be as far away as `MAX_FACTOR`: filters and drifts have their times in seconds. The times of
     the samples show stamps in batches.
 
     Raises:
@@ -45,7 +45,7 @@ def at_rate(model: BiasModel, rate_hz: float, where: object, t_ns: Stamps | None
         return model
     mean_hz = 1e9 * (len(t_ns) - 1) / max(int(t_ns[-1] - t_ns[0]), 1) if t_ns is not None else 0.0
     batches = abs(mean_hz / model.rate_hz - 1) < RATE_TOLERANCE
-    possible = not (batches or model.counts_samples) and 1 / MOST_FACTOR < rate_hz / model.rate_hz < MOST_FACTOR
+    possible = not (batches or model.counts_samples) and 1 / MAX_FACTOR < rate_hz / model.rate_hz < MAX_FACTOR
     if possible and force:
         out = model.at(rate_hz)
         out.remarks = (*model.remarks, f"samples at {rate_hz:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
@@ -64,12 +64,12 @@ def other_conditions(model: BiasModel, samples: tuple[Float64[np.ndarray, " n"],
     noise = white_noise(np.concatenate([samples[1], samples[2]], axis=1))
     known = model.noise_std > 0
     ratio = float((noise[known] / model.noise_std[known]).max()) if known.any() else 0.0
-    if ratio > MOST_NOISE:  # less noise is no doubt: a drone in the hand has a tenth of that in flight
+    if ratio > MAX_NOISE:  # less noise is no doubt: a drone in the hand has a tenth of that in flight
         sentences.append(f"the samples are {ratio:.0f} times as noisy as in the training runs: another sensor, or vibration")
     steps = np.diff(samples[0])
     shorter, period_s, longer = (float(quantile(steps, share)) for share in (0.25, 0.5, 0.75))
     rate_hz, scatter = 1.0 / period_s, (longer - shorter) / period_s / math.sqrt(len(steps))  # of the median of uneven steps
-    if model.rate_hz and abs(rate_hz / model.rate_hz - 1.0) > MOST_RATE + SURE * scatter:
+    if model.rate_hz and abs(rate_hz / model.rate_hz - 1.0) > MAX_RATE + SURE * scatter:
         sentences.append(f"samples at {rate_hz:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
     return sentences
 
@@ -180,12 +180,12 @@ def _remarks(channel: Scalars, name: str, start_ns: int, end_ns: int, low: float
     """What makes the drift of a log less sure."""
     out, within = [], channel.between(start_ns, end_ns)
     T = within.values[:, 0] if len(within) else channel.values[:1, 0]
-    if T.min() < low - MOST_BEYOND_K or T.max() > high + MOST_BEYOND_K:
+    if T.min() < low - MAX_BEYOND_K or T.max() > high + MAX_BEYOND_K:
         gone, trained = f"{T.min():.1f} to {T.max():.1f} °C", f"{low:.1f} to {high:.1f} °C"
         out.append(f"{name} goes from {gone}, and training had {trained}: beyond, the bias goes on straight and is less sure")
     edges = np.concatenate([[start_ns], within.t_ns, [end_ns]])
     age_s = float(np.diff(edges).max()) * 1e-9
-    if age_s > MOST_AGE_S:
+    if age_s > MAX_AGE_S:
         out.append(f"{name} is silent for {age_s:.0f} s: its last number holds")
     return out
 
@@ -201,8 +201,8 @@ def _widened(model: BiasModel, spread: Vector6, walk: Vector6) -> BiasModel:
         "walk_std": np.sqrt(model.walk_std**2 + walk**2),
     }
     sessions = [{**session, "std": wider(session["std"]).tolist()} for session in model.card.get("sessions", [])]
-    least = model.card.get("turn_on_least_std")
-    model.card = {**model.card, "sessions": sessions, "turn_on_least_std": None if least is None else wider(least).tolist()}
+    minimum = model.card.get("turn_on_least_std")
+    model.card = {**model.card, "sessions": sessions, "turn_on_least_std": None if minimum is None else wider(minimum).tolist()}
     return model
 
 

@@ -24,7 +24,7 @@ from imutool.config import Settings
 from imutool.units import SENSORS, Sensor
 
 COLUMNS = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of a vector of six
-MOST_BIAS = 1e6  # rad/s and m/s²: more is no bias
+MAX_BIAS = 1e6  # rad/s and m/s²: more is no bias
 STATISTICS = ("prior_mean", "prior_std", "truth_std", "rest_std", "walk_std", "noise_std")
 GAP_S = 1.0  # a longer step of the stamps begins a new stretch: filters of the samples start anew, and no drift is integrated
 
@@ -296,5 +296,5 @@ def check_card(card: Mapping[str, Any]) -> None:
         raise ValueError(str(error)) from error
     widths = [session.std for session in found.sessions] + [found.turn_on_least_std] * (found.turn_on_least_std is not None)
     numbers = np.array([*widths, *(session.mean for session in found.sessions)], float).reshape(-1, 6)
-    if not (np.abs(numbers) <= MOST_BIAS).all() or (numbers[: len(widths)] < 0.0).any():
+    if not (np.abs(numbers) <= MAX_BIAS).all() or (numbers[: len(widths)] < 0.0).any():
         raise ValueError("the card has an impossible prior")

@@ -98,8 +98,8 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str
         raise ModelError(f"is not a model file ({error})", where=path, expected="safetensors by imutool train") from error
 
 
-def _refuse_size(path: Path, most: int) -> None:
-    """Refuse a path that is not a regular file, or is larger than `most` bytes; reading a pipe would block.
+def _refuse_size(path: Path, maximum: int) -> None:
+    """Refuse a path that is not a regular file, or is larger than `maximum` bytes; reading a pipe would block.
 
     Raises:
         ModelError: too large, or not a regular file.
@@ -110,8 +110,8 @@ def _refuse_size(path: Path, most: int) -> None:
         raise ModelError(
             "is not a model file (it is a folder, a pipe or a device)", where=path, expected="safetensors by imutool train"
         )
-    if size > most:
-        raise ModelError(f"{size} bytes", where=path, expected=f"a model of at most {most}")
+    if size > maximum:
+        raise ModelError(f"{size} bytes", where=path, expected=f"a model of at most {maximum}")
 
 
 def load(path: Path) -> BiasModel:
@@ -128,16 +128,16 @@ def load(path: Path) -> BiasModel:
         expected = {name: (shape, np.dtype(np.float32)) for name, shape in kind.shapes(settings).items()}
     except (ValueError, OverflowError, ImutoolError) as error:
         raise ModelError(f"has an invalid header ({error})", where=path) from error
-    held = {name: (value.shape, value.dtype) for name, value in tensors.items()}
-    if held != expected:
-        wrong = sorted(name for name in expected.keys() | held.keys() if expected.get(name) != held.get(name))
+    layout = {name: (value.shape, value.dtype) for name, value in tensors.items()}
+    if layout != expected:
+        wrong = sorted(name for name in expected.keys() | layout.keys() if expected.get(name) != layout.get(name))
         raise ModelError(f"tensors {', '.join(wrong[:5])} do not fit", where=path, expected=f"those of {header.method}")
     if any(not np.isfinite(value).all() for value in tensors.values()):
         raise ModelError("holds numbers that are not finite", where=path)
     if any((np.abs(value) > MAX_WEIGHT).any() for value in tensors.values()):
         raise ModelError("holds numbers that no training gives", where=path, expected=f"at most {MAX_WEIGHT:g}")
-    least = {".scale": MIN_SCALE, ".units": MIN_SCALE, ".var": 0.0}  # divisors
-    if any((value < least.get(Path(name).suffix, -MAX_WEIGHT)).any() for name, value in tensors.items()):
+    minimum = {".scale": MIN_SCALE, ".units": MIN_SCALE, ".var": 0.0}  # divisors
+    if any((value < minimum.get(Path(name).suffix, -MAX_WEIGHT)).any() for name, value in tensors.items()):
         raise ModelError("holds scales that no training gives", where=path, expected=f"at least {MIN_SCALE:g}")
     model = kind(settings, header.rate_hz, tensors)
     model.card = {**header.card, "name": path.stem, "sha256": digest(path)}

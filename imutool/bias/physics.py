@@ -38,7 +38,7 @@ from imutool.units import AXES, SENSORS, Sensor
 # Spread of a bias from run to run: of the ADIS16448 in EuRoC's training sequences, 2 mrad/s and 0.02 m/s². Where the file
 # has no bias: data sheet of a consumer sensor, as in `imutool.bias.static`.
 TURN_ON_STD, UNKNOWN_STD = (2e-3, 0.02), (0.05, 0.4)
-MOST_TAU_S = 0.01  # for a larger clock offset the derivative's noise exceeds the removed error
+MAX_TAU_S = 0.01  # for a larger clock offset the derivative's noise exceeds the removed error
 MOUNT = "mount_rotation"
 MATRIX = {  # effects that are a factor of a sensor's matrix
     "gyro_scale": "gyro",
@@ -180,7 +180,7 @@ def _is_corrected(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
         return True
     (effect,) = (LATE_GYRO,) if entry.name == LATE_GYRO.name else catalogue.effects([entry.name])
     of_samples = effect.linear and effect.stage == Stage.SENSOR and not effect.needs  # its error follows from the samples alone
-    if not (effect.trained or of_samples) or (effect.stage == Stage.CLOCK and abs(_value(entry, "tau")) > MOST_TAU_S):
+    if not (effect.trained or of_samples) or (effect.stage == Stage.CLOCK and abs(_value(entry, "tau")) > MAX_TAU_S):
         return False
     if entry.name in DRIFTS:
         fixed = (replace(parameter, fixed_in_training=_value(entry, "tau")) for parameter in effect.parameters[3:])

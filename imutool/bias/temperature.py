@@ -31,8 +31,8 @@ from imutool.units import AXES, SENSORS, Sensor
 
 ORDERS = 3
 ZERO_CELSIUS_K = 273.15
-MOST_BEYOND = 5.0  # half ranges, beyond the trained one, for which the bias goes on: a channel may have a wrong number
-LEAST_KELVIN = 200.0  # no sensor works at as many °C, none at fewer kelvin
+MAX_BEYOND = 5.0  # half ranges, beyond the trained one, for which the bias goes on: a channel may have a wrong number
+MIN_KELVIN = 200.0  # no sensor works at as many °C, none at fewer kelvin
 PLAUSIBLE: Mapping[Sensor, tuple[str, float]] = {"gyro": ("rad/s", 0.01), "accel": ("m/s²", 0.1)}
 Terms = Float64[np.ndarray, "n 12"]
 
@@ -108,20 +108,20 @@ class TemperatureFilter:
         """Terms from this number on."""
         at = (celsius - self._centre) / self._half_range
         s = min(1.0, max(-1.0, at))
-        now = np.array([s, 1.5 * s**2 - 0.5, 2.5 * s**3 - 1.5 * s]) + _straight_on(at)[0]
+        basis = np.array([s, 1.5 * s**2 - 0.5, 2.5 * s**3 - 1.5 * s]) + _straight_on(at)[0]
         if self._z is None:
-            self._z = np.tile(now, (1 + len(LOAD_TAU_S), 1))
+            self._z = np.tile(basis, (1 + len(LOAD_TAU_S), 1))
         else:
             keep = np.exp(-1e-9 * max(0, t_ns - self._t_ns) / LOAD_TAU_S)[:, None]  # a clock may be set back
             self._z[1:] = self._z[0] + keep * (self._z[1:] - self._z[0])
-            self._z[0] = now
+            self._z[0] = basis
         self._t_ns = t_ns
         return self._z.ravel().copy()
 
 
 def _straight_on(s: Float64[np.ndarray, " n"] | float) -> Float64[np.ndarray, "n 3"]:
     """What Legendre polynomials gain beyond -1 to 1 by their slope at the end."""
-    beyond = np.reshape(s - np.clip(s, -1.0, 1.0), (-1, 1)).clip(-MOST_BEYOND, MOST_BEYOND)
+    beyond = np.reshape(s - np.clip(s, -1.0, 1.0), (-1, 1)).clip(-MAX_BEYOND, MAX_BEYOND)
     return np.asarray(beyond * [1.0, 3.0, 6.0] * np.sign(beyond) ** [0, 1, 2])
 
 
@@ -191,4 +191,4 @@ def _celsius(channel: Scalars) -> Scalars:
 
 def celsius_of(temperature: float) -> float:
     """°C of a temperature in °C or kelvin, told by its size."""
-    return temperature - ZERO_CELSIUS_K if temperature > LEAST_KELVIN else temperature
+    return temperature - ZERO_CELSIUS_K if temperature > MIN_KELVIN else temperature

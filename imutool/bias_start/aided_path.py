@@ -22,7 +22,7 @@ from msgspec import Meta
 from imutool.array_types import Bool, Float64
 from imutool.bias.model import Vector6
 from imutool.bias_start.bias_tracking import Aiding, BiasFilter, FilteredBlock, smooth_blocks
-from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, relative_samples
+from imutool.bias_start.initial_bias import AT_REST_STD, MIN_STD, InitialBias, relative_samples
 from imutool.bias_start.prior_width import BiasPrior
 from imutool.config import Settings
 from imutool.geometry import quaternion
@@ -67,8 +67,8 @@ def residual_prior(start: InitialBias | None = None, std: Float64[np.ndarray, "n
     It is as wide as the start states, or less where `std`, the deviation of the subtracted bias, became smaller.
     """
     median = np.array(RAW_STD) if std is None else np.median(std, axis=0)
-    least = median if start is None else np.minimum(start.std, median)
-    return BiasPrior(np.zeros(6), np.maximum(least, LEAST_STD), AT_REST_STD)
+    minimum = median if start is None else np.minimum(start.std, median)
+    return BiasPrior(np.zeros(6), np.maximum(minimum, MIN_STD), AT_REST_STD)
 
 
 def aided_path(imu: Imu, start: StartPose, prior: BiasPrior, aids: Aids, settings: AidSettings | None = None) -> Poses:

@@ -28,21 +28,21 @@ from imutool.bias_start.initial_bias import (
     tracked_from_prior,
     training_source,
 )
-from imutool.bias_start.prior_width import MOST_DEVIATIONS, BiasPrior, supported_std, widened
+from imutool.bias_start.prior_width import MAX_DEVIATIONS, BiasPrior, supported_std, widened
 from imutool.errors import DataError
-from imutool.inertial.inertial_filter import LEAST_FORCE_M_S2
-from imutool.inertial.innovations import LEAST_DRIVEN_M_S, SURPRISING, innovations
-from imutool.inertial.stationary import MOST_SHAKING, Blocks, rest_stretches, resting_blocks, white_noise
+from imutool.inertial.inertial_filter import MIN_FORCE_M_S2
+from imutool.inertial.innovations import MIN_DRIVEN_M_S, SURPRISING, innovations
+from imutool.inertial.stationary import MAX_SHAKING, Blocks, rest_stretches, resting_blocks, white_noise
 from imutool.recording import GRAVITY_M_S2, Imu, nanoseconds
 from imutool.recording.columns import true_ranges
 
 LOOK_AHEAD_S = 60.0  # in which a log that begins in motion may stop: what the start of a command reads
 REST_BEGINS_WITHIN_S = 5.0  # a later stop would give a bias from the future
-MOST_UNKNOWN = 1e-3  # rad/s, deviation of a bias that may be left unknown: 3 degrees in a minute
-UNTRAINED = BiasPrior(np.zeros(6), np.full(6, np.inf), np.full(6, MOST_UNKNOWN))  # of the change from stop to stop
+MAX_UNKNOWN = 1e-3  # rad/s, deviation of a bias that may be left unknown: 3 degrees in a minute
+UNTRAINED = BiasPrior(np.zeros(6), np.full(6, np.inf), np.full(6, MAX_UNKNOWN))  # of the change from stop to stop
 UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sensor nobody calibrated (BMI160 of TUM-VI: 1.3)
 REFUTED, SURE, UNUSUAL = 15.0, 3.0, 2.0  # log-likelihood and deviations that refute a stop; deviations that ask for both
-MOST_SURPRISING = 0.05  # share of such innovations; training logs 0.00, other sensors at least 0.05 where bias is no evidence
+MAX_SURPRISING = 0.05  # share of such innovations; training logs 0.00, other sensors at least 0.05 where bias is no evidence
 PIECE = 512  # samples, of which the search for a stop takes no more than it needs
 
 
@@ -111,7 +111,7 @@ def _drifts(gyro: Float64[np.ndarray, "n 3"]) -> bool:
     """Whether the mean of a gyro at rest moves from the first third of a stop to the last, as while it warms up."""
     first, _, last = np.array_split(gyro, 3)
     noise = np.sqrt(2.0 * gyro.var(axis=0) / max(len(first), 1))
-    return bool((np.abs(last.mean(axis=0) - first.mean(axis=0)) > MOST_UNKNOWN + MOST_DEVIATIONS * noise).any())
+    return bool((np.abs(last.mean(axis=0) - first.mean(axis=0)) > MAX_UNKNOWN + MAX_DEVIATIONS * noise).any())
 
 
 def _at_rest_variance(model: BiasModel, samples: Float64[np.ndarray, "n 6"]) -> Vector6:
@@ -140,7 +140,7 @@ def at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     mean = residual.mean(axis=0)
     squares = ((residual - mean) ** 2).sum(axis=0)
     stretch = _RestStretch(mean, squares, len(samples), int(samples.t_ns[0]), int(samples.t_ns[-1]))
-    supported = supported_std(start.std, start.least, mean - start.rest, _at_rest_variance(model, residual))
+    supported = supported_std(start.std, start.minimum, mean - start.rest, _at_rest_variance(model, residual))
     start = replace(start, std=supported)
     return _combined(start, [stretch], int(imu.t_ns[0]))
 
@@ -172,7 +172,7 @@ def _calm(blocks: Blocks, ranges: Sequence[tuple[int, int]]) -> Sequence[tuple[i
     counts = [min(b - a, max(1, round((b - a) * block_s))) for a, b in ranges]  # at 1 Hz a block has two seconds
     pieces = [piece for (a, b), n in zip(ranges, counts, strict=True) for piece in np.array_split(np.arange(a, b), n)]
     noise = np.sqrt([blocks.var[piece].mean(axis=0).reshape(2, 3).sum(axis=1) for piece in pieces]).reshape(-1, 2)
-    for piece in itertools.compress(pieces, (noise <= MOST_SHAKING * noise.min(axis=0, initial=np.inf)).all(axis=1)):
+    for piece in itertools.compress(pieces, (noise <= MAX_SHAKING * noise.min(axis=0, initial=np.inf)).all(axis=1)):
         calm[piece] = True
     return true_ranges(calm) if calm.any() else ranges
 
@@ -192,7 +192,7 @@ def rest_differences(
     for log, ((t_s, gyro, accel), in_motion) in enumerate(zip(logs, rest, strict=True)):
         t_ns = np.round(t_s * 1e9).astype(np.int64)
         residual = np.concatenate([gyro, accel], axis=1) - model.stream(in_motion)(t_s, gyro, accel)
-        stands = np.ones(len(t_s), bool) if velocities is None else np.linalg.norm(velocities[log], axis=1) < LEAST_DRIVEN_M_S
+        stands = np.ones(len(t_s), bool) if velocities is None else np.linalg.norm(velocities[log], axis=1) < MIN_DRIVEN_M_S
         stops = [np.arange(first, last)[stands[first:last]] for first, last in rest_stretches(Imu(t_ns, gyro, accel))]
         means = [residual[stop].mean(axis=0) for stop in stops if len(stop)]
         out.append(np.array([[*m[:3], *[np.linalg.norm(m[3:]) - GRAVITY_M_S2] * 3] for m in means]).reshape(-1, 6))
@@ -220,7 +220,7 @@ def refuted_stops(samples: Samples) -> tuple[Vector6, Vector6] | None:
     if not moving:
         return None
     stopped, moved = (innovations(block.step for block in blocks) for blocks in moving)
-    if (moved.chi_square > SURPRISING).mean() > MOST_SURPRISING:  # of a clipped gyro, which gravity contradicts in any case
+    if (moved.chi_square > SURPRISING).mean() > MAX_SURPRISING:  # of a clipped gyro, which gravity contradicts in any case
         return None
     last = moving[1][-1].step.after
     ends = samples[0].searchsorted((later[0][0].start_s, later[0][0].end_s))
@@ -241,7 +241,7 @@ def changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], prio
         std = np.sqrt(prior.walk[:3] ** 2 * apart_s + 2.0 * prior.ground_std[:3] ** 2 + noise)
         change = last.mean(axis=0) - first.mean(axis=0)
         axis = int(np.argmax(np.abs(change) / std))
-        if abs(change[axis]) > MOST_DEVIATIONS * std[axis]:
+        if abs(change[axis]) > MAX_DEVIATIONS * std[axis]:
             yield (
                 f"the gyro's bias about {'xyz'[axis]} moves by {change[axis]:+.2g} rad/s in {apart_s:.0f} s, from stop to stop,"
                 f" {abs(change[axis]) / std[axis]:.0f} standard deviations of its usual walk: it warms up, or drifts"
@@ -254,7 +254,7 @@ def shown_at_rest(samples: Samples) -> tuple[Vector6, Vector6]:
     (at_stops,) = rest_differences(static.Model(), [samples], np.zeros((1, 6)))
     shown, std = np.zeros(6), np.full(6, np.inf)
     if len(at_stops):
-        shown[:3], std[:3] = at_stops[:, :3].mean(axis=0), np.hypot(at_stops[:, :3].std(axis=0), MOST_UNKNOWN)
+        shown[:3], std[:3] = at_stops[:, :3].mean(axis=0), np.hypot(at_stops[:, :3].std(axis=0), MAX_UNKNOWN)
     return shown, std
 
 
@@ -281,7 +281,7 @@ def _combined(start: InitialBias, stretches: Sequence[_RestStretch], first_ns: i
     for stretch in stretches:  # attitude may differ from stop to stop: each shows another direction
         force = stretch.mean[3:] - rest[3:]
         size = float(np.linalg.norm(force))
-        if size < LEAST_FORCE_M_S2:  # no direction, hence nothing along it
+        if size < MIN_FORCE_M_S2:  # no direction, hence nothing along it
             continue
         up = force / size
         gain = var[3:] * up / (up @ (var[3:] * up) + AT_REST_STD[3] ** 2)

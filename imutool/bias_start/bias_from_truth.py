@@ -13,7 +13,7 @@ import numpy as np
 from imutool.array_types import Bool, Float64, Int64
 from imutool.bias.model import COLUMNS, Array, BiasModel, Vector6
 from imutool.bias_start.initial_bias import (
-    LEAST_STD,
+    MIN_STD,
     TRACKED_BY,
     InitialBias,
     accuracy,
@@ -31,7 +31,7 @@ from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
 from imutool.recording.columns import median
 
 TRUTH_S = 15.0  # length of truth for a start: of 3, 5, 8, 10 and 15 s the best on training logs left out in turn
-LEAST_TRUTH_S = 1.0
+MIN_TRUTH_S = 1.0
 CHECKED_S = 60.0  # of truth and gyro that are compared first: 15 s do not always show a clock
 NOT_SEEN = 1e3  # m/s²: deviation of the accelerometer's bias from poses without positions
 WORLD_TILT_STD = np.array([0.0] * 3 + [0.1] * 3)  # m/s²: half a degree, as of EuRoC's second Vicon room
@@ -43,9 +43,9 @@ MOUNT_STD = 0.05  # rad: plausible rotation of markers that were meant to be str
 OWN_MOUNT_STD = 0.005  # rad: of a log's markers against those of the training logs, which the model knows
 SAME = 100.0  # samples whose poses have the same error
 PARTS, CONTRADICTED = 3, 22.5  # of a start; chi-square of their scatter on three axes, exceeded once in a thousand usual starts
-LEAST_TRUTH_STD = np.array([5e-5] * 3 + [2e-3] * 3)  # rad/s and m/s²: no poses show a bias better
+MIN_TRUTH_STD = np.array([5e-5] * 3 + [2e-3] * 3)  # rad/s and m/s²: no poses show a bias better
 ITERATIONS = 4
-MOST_TURN_RAD = 2.0  # by a bias: a turn is known up to pi, so that of a larger bias begins near the median of its steps
+MAX_TURN_RAD = 2.0  # by a bias: a turn is known up to pi, so that of a larger bias begins near the median of its steps
 HUBER_MEDIANS = 1.5  # threshold of an outlier, in medians of the residuals
 
 Rows = Float64[np.ndarray, "n 3"]
@@ -70,8 +70,8 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     usable = np.flatnonzero(trusted)
     usable = usable[t[usable] <= t[usable[0]] + truth_s] if len(usable) else usable
     length_s = float(t[usable[-1]] - t[usable[0]]) if len(usable) else 0.0
-    if length_s < LEAST_TRUTH_S:
-        expected = f"at least {LEAST_TRUTH_S:g} s of it at the start"
+    if length_s < MIN_TRUTH_S:
+        expected = f"at least {MIN_TRUTH_S:g} s of it at the start"
         raise DataError(f"{length_s:.1f} s of truth", where=recording.name, expected=expected)
     rows = slice(int(usable[0]), int(usable[-1]) + 1)
     piece, poses = imu.rows(rows), poses.rows(rows)
@@ -91,7 +91,7 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     variance = _variance(usual, thirds, _by_calibration(model, piece, parts[1:])) if len(thirds) == PARTS else usual
     if not truth.has_positions:
         offset[3:], variance[3:] = 0.0, NOT_SEEN**2
-    start = replace(start, std=supported_std(start.std, start.least, offset, variance + WORLD_TILT_STD**2))
+    start = replace(start, std=supported_std(start.std, start.minimum, offset, variance + WORLD_TILT_STD**2))
     rest, std = _updated(start, offset, variance)
     late = f", of poses {1e3 * abs(late_s):.0f} ms {'late' if late_s > 0 else 'early'}" if late_s else ""
     doubt = ", whose thirds contradict each other" if (variance > usual)[:3].any() else ""
@@ -100,7 +100,7 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     if not model.card:
         return InitialBias(rest, std, how)
     mean, spread = _updated(start, offset, variance + WORLD_TILT_STD**2)
-    before = replace(bias_prior(model), mean=mean, std=np.maximum(spread, LEAST_STD), least=None)
+    before = replace(bias_prior(model), mean=mean, std=np.maximum(spread, MIN_STD), minimum=None)
     ends_s = seconds(piece.t_ns[-1:], int(recording.imu.t_ns[0]))[0]
     return InitialBias(rest, std, f"{how}, then {TRACKED_BY}", follows=before, hold_s=float(ends_s))
 
@@ -122,9 +122,9 @@ def _variance(usual: Vector6, thirds: Sequence[Vector6], by_calibration: Vector6
     calibration allows, because the body moves otherwise in each.
     """
     variance, shown = usual.copy(), np.var(thirds, axis=0, ddof=1)
-    least = PARTS**2.5 * (np.maximum(usual, LEAST_TRUTH_STD**2) + WORLD_TILT_STD**2) + by_calibration
+    minimum = PARTS**2.5 * (np.maximum(usual, MIN_TRUTH_STD**2) + WORLD_TILT_STD**2) + by_calibration
     for axes in COLUMNS.values():
-        if (PARTS - 1) * (shown[axes] / least[axes]).sum() > CONTRADICTED:
+        if (PARTS - 1) * (shown[axes] / minimum[axes]).sum() > CONTRADICTED:
             variance[axes] = np.maximum(usual[axes], np.maximum(shown[axes], shown[axes].mean()) / PARTS)
     return variance
 
@@ -151,12 +151,12 @@ def poses_turn_alone(imu: Imu, truth: Poses) -> Bool[np.ndarray, " n"]:
         off = quaternion.rotate(by_gyro[begin], off)  # in one frame, that of the first sample: the body turns over a gap
         padded = np.pad(off, ((1, 1), (0, 0)))
         misfit, lasting = (np.linalg.norm(x, axis=1) for x in (off, padded[:-2] + off + padded[2:]))
-        most = np.maximum(
+        maximum = np.maximum(
             JUMP_SHARE * np.linalg.norm(quaternion.log(seen), axis=1), max(JUMP_RAD, JUMP_MEDIANS * median(misfit[known]))
         )
         clipped = np.logical_or.reduce([at_limit(column) for column in imu.gyro.T])[:-1]
         lost = np.logical_or.reduceat(clipped | (dt > LOST * median(dt)), begin)
-        out[begin[0] : end[-1]] = np.repeat(known & (lost | ((misfit > most) & (lasting > most))), end - begin)
+        out[begin[0] : end[-1]] = np.repeat(known & (lost | ((misfit > maximum) & (lasting > maximum))), end - begin)
     return out
 
 
@@ -192,7 +192,7 @@ def bias_from_truth(
     known = trusted[:-1] & trusted[1:]
     of_poses = quaternion.log(steps[known]) / dt[known]
     coarse = np.median(_step_means(rate)[known] - of_poses, axis=0) if known.any() else np.zeros(3)
-    if float(np.linalg.norm(coarse)) * float(t_s[-1] - t_s[0]) > MOST_TURN_RAD:
+    if float(np.linalg.norm(coarse)) * float(t_s[-1] - t_s[0]) > MAX_TURN_RAD:
         offset[:3] = coarse
     for _ in range(ITERATIONS):
         running = _integrated(rate - offset[:3], dt)

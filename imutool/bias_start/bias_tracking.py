@@ -14,7 +14,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.bias.model import GAP_S, BiasEstimate, BiasModel
-from imutool.bias_start.prior_width import MOST_CHANGE, MOST_DEVIATIONS, BiasPrior
+from imutool.bias_start.prior_width import MAX_CHANGE, MAX_DEVIATIONS, BiasPrior
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State, Step
 from imutool.inertial.innovations import DriveDetector
@@ -126,9 +126,9 @@ class BiasFilter:
 
     def _arrived(self, t: Float64[np.ndarray, " n"], u: Float64[np.ndarray, "n 6"]) -> Iterator[tuple[_Block, bool]]:
         dt = t[1:] - t[:-1]
-        most = GAP_PERIODS * float(quantile(dt, 0.5)) if len(dt) > 1 else BLOCK_S * 1.5
-        whole = (longest := float(dt.max())) <= most
-        block = _Block(t, u, longest, 0.0 if whole else float(dt[dt > most].sum()))
+        maximum = GAP_PERIODS * float(quantile(dt, 0.5)) if len(dt) > 1 else BLOCK_S * 1.5
+        whole = (longest := float(dt.max())) <= maximum
+        block = _Block(t, u, longest, 0.0 if whole else float(dt[dt > maximum].sum()))
         rests = self._rest_detector(u[:-1, :3], u[:-1, 3:], whole=whole)
         rests = rests and (self._aiding is None or self._aiding.stops)
         self._waiting.append((block, rests))
@@ -140,8 +140,8 @@ class BiasFilter:
 
     def _rests(self, block: _Block) -> bool:
         """Whether a block that looks like rest has a rate that a bias can have."""
-        rate, usual = block.u[:-1, :3].mean(axis=0), MOST_CHANGE[:3]
-        own = np.abs(rate - self._prior.mean[:3]) < usual + MOST_DEVIATIONS * self._prior.std[:3]
+        rate, usual = block.u[:-1, :3].mean(axis=0), MAX_CHANGE[:3]
+        own = np.abs(rate - self._prior.mean[:3]) < usual + MAX_DEVIATIONS * self._prior.std[:3]
         return self._prior.stops and bool(own.all() or (np.abs(rate) < usual).all())
 
     def _pass(self, block: _Block, rests: bool) -> FilteredBlock:
@@ -153,8 +153,8 @@ class BiasFilter:
         if block.longest_s > GAP_S and self._aiding is not None:
             step = inertial_filter.pause_step(x, T, self._walk)
         elif block.longest_s > GAP_S:
-            most = np.maximum(self._prior.std**2, np.diag(x.covariance(False)))
-            step = inertial_filter.reset_pose(x, u[-1, 3:], T, self._prior.walk, most, s)
+            maximum = np.maximum(self._prior.std**2, np.diag(x.covariance(False)))
+            step = inertial_filter.reset_pose(x, u[-1, 3:], T, self._prior.walk, maximum, s)
         else:
             step = _step(x, block, rests, self._walk, s)
             if rests and self._drives(block.u[:-1], step):
@@ -213,10 +213,10 @@ class TrackedBiasStream:
     Row k depends on samples up to k, and on the start. Until `hold_s` the rest bias is that of `held`, measured up to then.
     """
 
-    def __init__(self, model: BiasModel, prior: BiasPrior, held: BiasTrajectory, hold_s: float) -> None:
+    def __init__(self, model: BiasModel, prior: BiasPrior, known: BiasTrajectory, hold_s: float) -> None:
         self._motion, self._mean = model.stream(prior.mean), prior.mean
         self.filter = BiasFilter(prior)
-        self._held, self._now, self._hold_s, self._prior = held, held.rest[0], hold_s, prior
+        self._held, self._now, self._hold_s, self._prior = known, known.rest[0], hold_s, prior
         self._covariance = np.diag(prior.std**2)
 
     def __call__(

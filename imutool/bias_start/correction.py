@@ -19,17 +19,17 @@ from imutool.bias.log_binding import OnlineDrift, at_rate, bound
 from imutool.bias.model import GAP_S, BiasModel, SampleStream, Stream, Vector6
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias, model_samples, tracked_from_prior
-from imutool.bias_start.stretches import LEAST_FORCE_M_S2, MOST, measured, unusual_gravity
+from imutool.bias_start.stretches import MAX, MIN_FORCE_M_S2, measured, unusual_gravity
 from imutool.errors import ConfigError, DataError
-from imutool.recording import LEAST_PERIOD_S, Imu, Times, nanoseconds
-from imutool.recording.columns import MOST_GAP_S, median
+from imutool.recording import MIN_PERIOD_S, Imu, Times, nanoseconds
+from imutool.recording.columns import MAX_GAP_S, median
 from imutool.units import FULL_SCALE_RAD_S
 
-USUAL_MOST = np.minimum(MOST, [FULL_SCALE_RAD_S] * 3 + [np.inf] * 3)
+USUAL_MAX = np.minimum(MAX, [FULL_SCALE_RAD_S] * 3 + [np.inf] * 3)
 CHECKED = 400  # first samples of a stream whose rate and gravity are checked: 2 s at 200 Hz
 logger = logging.getLogger(__name__)
 
-GAP_NS, MOST_GAP_NS = nanoseconds(GAP_S), nanoseconds(MOST_GAP_S)
+GAP_NS, MAX_GAP_NS = nanoseconds(GAP_S), nanoseconds(MAX_GAP_S)
 BLOCK_SAMPLES = 1 << 14  # corrected at once: a covariance has 288 bytes
 
 
@@ -132,7 +132,7 @@ class OnlineDebiaser:
             raise ConfigError(what, where="start", expected="a bias of `imutool.bias_at_rest`, or None")
         self._model, self._start, self._begun = model, start, False
         self._start_ns, self._before_ns, self._bias = 0, 0, np.zeros(6)
-        self._u, self._most, self._left_out = np.full(6, np.nan), USUAL_MOST, 0
+        self._u, self._maximum, self._left_out = np.full(6, np.nan), USUAL_MAX, 0
         self._drift = OnlineDrift(model) if model.temperature_parameters() else None
         self._first: list[tuple[int, Float64[np.ndarray, "3"]]] | None = []  # None once they are checked
         self._with_covariance, self._covariance = with_covariance, np.full((6, 6), np.nan)
@@ -179,12 +179,12 @@ class OnlineDebiaser:
             what = f"gyro and accel of shape {list(np.shape(gyro))}, {list(np.shape(accel))} at {stamp_ns!r:.60}"
             raise DataError(what, where="OnlineDebiaser", expected="one sample of 3 numbers each, at integer nanoseconds")
         size = np.abs(u)
-        measured = (size <= self._most).all()  # false for NaN
-        if not measured and (size <= MOST).all():
+        measured = (size <= self._maximum).all()  # false for NaN
+        if not measured and (size <= MAX).all():
             logger.warning("OnlineDebiaser: gyro looks like deg/s, not rad/s: it reaches %.4g", size[:3].max())
-            measured, self._most = True, MOST
+            measured, self._maximum = True, MAX
         repeats = stamp_ns == self._before_ns and np.array_equal(u, self._u)
-        if measured and size[3:].max() >= LEAST_FORCE_M_S2 and not repeats:
+        if measured and size[3:].max() >= MIN_FORCE_M_S2 and not repeats:
             self._u = u
             if self._first is not None:
                 self._check_first(stamp_ns, u[3:])
@@ -230,12 +230,12 @@ class OnlineDebiaser:
         t_ns, counts = np.unique(np.array([stamp_ns for stamp_ns, _ in first], np.int64), return_counts=True)
         steps = np.diff(t_ns) * 1e-9
         periods = [float(steps.mean()), float(median(steps))] if len(steps) else [0.0]
-        if max(periods) < LEAST_PERIOD_S:
+        if max(periods) < MIN_PERIOD_S:
             what = f"the first {len(first)} samples have {len(t_ns)} stamps, {max(periods) * 1e9:.3g} ns apart"
             what = (
                 f"{what}: the stamps are not in nanoseconds" if len(steps) else f"the first {len(first)} samples have one stamp"
             )
-            raise DataError(what, where="OnlineDebiaser", expected=f"steps of at least {LEAST_PERIOD_S * 1e9:.0f} ns")
+            raise DataError(what, where="OnlineDebiaser", expected=f"steps of at least {MIN_PERIOD_S * 1e9:.0f} ns")
         if repeated := len(first) - len(t_ns):
             what = "OnlineDebiaser: %d of the first %d samples have the stamp of another: give each its own time"
             logger.warning(what, repeated, len(first))
@@ -253,7 +253,7 @@ class OnlineDebiaser:
             logger.warning("live stream: %s", "; ".join(self._model.remarks))
 
     def _seconds(self, stamp_ns: int) -> float:
-        """Seconds since the first sample; a jump of the clock counts as at most `stretches.MOST_GAP_S`."""
+        """Seconds since the first sample; a jump of the clock counts as at most `stretches.MAX_GAP_S`."""
         if not self._begun:
             self._begun, self._start_ns, self._before_ns = True, stamp_ns, stamp_ns
             start = self._start or tracked_from_prior(self._model, stamp_ns)
@@ -261,8 +261,8 @@ class OnlineDebiaser:
         step_ns = stamp_ns - self._before_ns
         if -GAP_NS < step_ns < 0:  # out of order: no time passes
             self._start_ns += step_ns
-        elif not 0 <= step_ns <= MOST_GAP_NS:
-            self._start_ns += step_ns - MOST_GAP_NS
+        elif not 0 <= step_ns <= MAX_GAP_NS:
+            self._start_ns += step_ns - MAX_GAP_NS
         self._before_ns = stamp_ns
         return (stamp_ns - self._start_ns) * 1e-9
 

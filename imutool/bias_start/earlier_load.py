@@ -29,13 +29,13 @@ from imutool.sensor.signals import LOAD_TAU_S, LOADS, ON, Load, SignalFilter
 EARLIER_S = np.array([0.0, 16.0, 32.0, 64.0, 128.0, 512.0])
 COLD = 0.5  # prior probability of T = 0; the others share the rest
 PRIOR = np.array([COLD, *[(1.0 - COLD) / (len(EARLIER_S) - 1)] * (len(EARLIER_S) - 1)])
-LEAST_COLD = 0.2  # probability of T = 0, below which the start is not cold: a log that says nothing changes nothing
+MIN_COLD = 0.2  # probability of T = 0, below which the start is not cold: a log that says nothing changes nothing
 
 
 def with_earlier_load(model: BiasModel, batches: Iterable[Samples], first_ns: int | None = None) -> BiasModel:
     """Model whose drift begins where the log shows the sensor.
 
-    It is the model itself if a cold start is likely enough (`LEAST_COLD`), or if its earlier load is given. `batches` are
+    It is the model itself if a cold start is likely enough (`MIN_COLD`), or if its earlier load is given. `batches` are
     seconds since the log's first sample, gyro and accel; as many count as for the fitness.
     """
     if not model.follows_load() or model.load_before is not None:
@@ -47,7 +47,7 @@ def with_earlier_load(model: BiasModel, batches: Iterable[Samples], first_ns: in
     log_likelihood = _log_likelihood([after_load(model, load) for load in loads], samples, first_ns)
     weights = PRIOR * np.exp(log_likelihood - log_likelihood.max())
     weights /= weights.sum()
-    if weights[0] >= LEAST_COLD:
+    if weights[0] >= MIN_COLD:
         return model
     return after_load(model, np.einsum("t,tkl->kl", weights, loads))
 

@@ -29,8 +29,8 @@ from imutool.bias.model import BiasModel, Vector6
 from imutool.bias.model_file import library, shipped_for
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import (
-    MOST_SURPRISING,
-    MOST_UNKNOWN,
+    MAX_SURPRISING,
+    MAX_UNKNOWN,
     UNKNOWN_STD,
     UNTRAINED,
     changed_at_rest,
@@ -39,14 +39,14 @@ from imutool.bias_start.bias_at_rest import (
     stops_in,
 )
 from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_together, stops_of
-from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
+from imutool.bias_start.initial_bias import AT_REST_STD, MIN_STD, InitialBias, bias_prior
 from imutool.bias_start.prior_width import (
-    MOST_CHANGE,
-    MOST_DEVIATIONS,
+    MAX_CHANGE,
+    MAX_DEVIATIONS,
     TELLING,
     BiasPrior,
     contradicted_start,
-    most_left,
+    max_left,
     supported_std,
     turned_axes,
     untold_bias,
@@ -56,13 +56,13 @@ from imutool.inertial.innovations import SURPRISING, Innovations, Share, innovat
 from imutool.recording import GRAVITY_M_S2
 
 CHECKED_S = 120.0  # of a log that the check reads
-LEAST_SPEED_M_S, LEAST_PIVOT_M = 1.0, 1e-3  # of the filter: an arm and a tight bound would take up what a wrong scale leaves
-MOST_OF_GUESS = np.array([3.0] * 3 + [MOST_DEVIATIONS] * 3)  # the same where few sessions leave the prior's width to a guess
-LEAST_EVIDENCE = -40.0  # log-likelihood of the model against none
+MIN_SPEED_M_S, MIN_PIVOT_M = 1.0, 1e-3  # of the filter: an arm and a tight bound would take up what a wrong scale leaves
+MAX_OF_GUESS = np.array([3.0] * 3 + [MAX_DEVIATIONS] * 3)  # the same where few sessions leave the prior's width to a guess
+MIN_EVIDENCE = -40.0  # log-likelihood of the model against none
 DEPENDENT = 2.0  # ratio of the shown bias's deviation to the filter's, which takes velocities for independent; a hand circles
-HALF, MOST_SHARE = 0.5, 1.5  # of a correction: between them it does more good than harm
-LEAST_SHARE = -2.0  # below, the log lacks so much else that the correction makes it worse by less than half
-LEAST_SHOWN = 0.005  # deviation of a share that a percentage shows
+HALF, MAX_SHARE = 0.5, 1.5  # of a correction: between them it does more good than harm
+MIN_SHARE = -2.0  # below, the log lacks so much else that the correction makes it worse by less than half
+MIN_SHOWN = 0.005  # deviation of a share that a percentage shows
 STEADY_TURN, ONLY_GYRO = "what looks like a stop is a steady turn, by gravity in motion", np.array([0.0] * 3 + [np.inf] * 3)
 SURE, OWN = 3.0, 4.0  # standard deviations; of made-up sensors' own shares, the largest lies 3.8 from one
 
@@ -102,19 +102,19 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
 def _trained(model: BiasModel, start: InitialBias, samples: Samples, about: Mapping[str, str]) -> Fitness:
     """Fitness of a trained model."""
     prior = replace(_prior(model), stops=start.follows is None or start.follows.stops)
-    unknown = replace(prior, mean=np.where(np.abs(prior.mean) > UNKNOWN_STD, prior.mean, 0.0), std=UNKNOWN_STD, least=None)
+    unknown = replace(prior, mean=np.where(np.abs(prior.mean) > UNKNOWN_STD, prior.mean, 0.0), std=UNKNOWN_STD, minimum=None)
     corrected = _without_motion(model, samples, prior)
     found, none, unstarted = _evidence((corrected, samples, corrected), (prior, unknown, unknown))
     shown_std = np.sqrt(DEPENDENT**2 * found.variance + AT_REST_STD**2)
     other_start, harmful = contradicted_start(start.rest, start.std, prior.mean + found.difference, shown_std)
-    supported = supported_std(prior.std, prior.least, found.difference, DEPENDENT**2 * found.variance)
+    supported = supported_std(prior.std, prior.minimum, found.difference, DEPENDENT**2 * found.variance)
     prior = replace(prior, std=np.minimum(supported, prior.std))  # a contradiction widens nothing here
-    most = np.full(6, MOST_DEVIATIONS) if prior.least is None else MOST_OF_GUESS
+    maximum = np.full(6, MAX_DEVIATIONS) if prior.minimum is None else MAX_OF_GUESS
     share = share_of_correction(none.innovations, unstarted.innovations)
-    confirmed = HALF < share.value - SURE * share.std < MOST_SHARE
-    left = most_left(len(model.card.get("sessions", ())))
-    other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean, left, confirmed=confirmed)
-    other_bias, refuted = list(_other_bias(found, prior, most)), list(_refuted(share))
+    confirmed = HALF < share.value - SURE * share.std < MAX_SHARE
+    max_share = max_left(len(model.card.get("sessions", ())))
+    other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean, max_share, confirmed=confirmed)
+    other_bias, refuted = list(_other_bias(found, prior, maximum)), list(_refuted(share))
     contradictions = [*other_axes, *other_bias, *_disagreement(found, none), *refuted]
     if harmful or contradictions:
         used = _started(start, prior)
@@ -132,8 +132,8 @@ def _trained(model: BiasModel, start: InitialBias, samples: Samples, about: Mapp
         *other_conditions(model, samples),
         *_other_unit(model, about),
     ]
-    if not (doubts or confirmed or _same_unit(model, about)) and (untold := untold_bias(prior.mean, _shown_std(found, prior))):
-        doubts.append(untold)
+    if not (doubts or confirmed or _same_unit(model, about)) and (doubt := untold_bias(prior.mean, _shown_std(found, prior))):
+        doubts.append(doubt)
     if doubts:
         return Fitness("doubtful", tuple(doubts))
     agreement = _shown_share(share) if confirmed else _agreement(found, prior, share)
@@ -186,14 +186,14 @@ def _without_motion(model: BiasModel, samples: Samples, prior: BiasPrior) -> Sam
 
 def _started(start: InitialBias, prior: BiasPrior) -> BiasPrior:
     """Prior with which a start begins; one that the user gives is no part of the model."""
-    own = {"mean": start.rest, "std": np.maximum(start.std, LEAST_STD)} if start.std.any() else {}
+    own = {"mean": start.rest, "std": np.maximum(start.std, MIN_STD)} if start.std.any() else {}
     return start.follows or replace(prior, **own)
 
 
 def _evidence(samples: Sequence[Samples], priors: Sequence[BiasPrior]) -> list[_Evidence]:
     """Evidence of samples at the same times, which hold no motion-dependent bias, each about its prior of a constant bias."""
     settings = priors[0].settings  # all are of one model
-    careful = msgspec.structs.replace(settings, speed_m_s=max(settings.speed_m_s, LEAST_SPEED_M_S), pivot_m=LEAST_PIVOT_M)
+    careful = msgspec.structs.replace(settings, speed_m_s=max(settings.speed_m_s, MIN_SPEED_M_S), pivot_m=MIN_PIVOT_M)
     filters = [BiasFilter(replace(prior, walk=np.zeros(6)), careful, ahead=True) for prior in priors]
     return [_shown(blocks, prior) for blocks, prior in zip(filter_together(filters, samples), priors, strict=True)]
 
@@ -216,10 +216,10 @@ def _shown(blocks: Sequence[FilteredBlock], prior: BiasPrior) -> _Evidence:
 def _not_shown(start: InitialBias, found: _Evidence) -> Iterator[str]:
     """Sentence on a bias that the log shows less well than its start, and whose deviation exceeds the gyro's bias."""
     before, shown = start.std[:3], DEPENDENT * np.sqrt(found.variance[:3])
-    std = 1.0 / np.sqrt(1.0 / np.maximum(before, LEAST_STD[:3]) ** 2 + 1.0 / shown**2)
+    std = 1.0 / np.sqrt(1.0 / np.maximum(before, MIN_STD[:3]) ** 2 + 1.0 / shown**2)
     unknown = np.where((shown > before) & (std > np.linalg.norm(start.rest[:3])), std, 0.0)
     axis = int(np.argmax(unknown))
-    if unknown[axis] > MOST_UNKNOWN:
+    if unknown[axis] > MAX_UNKNOWN:
         bias = f"the start's {start.rest[axis]:+.2g} ± {std[axis]:.2g} rad/s"
         yield f"neither stops nor gravity shows the gyro's bias about {'xyz'[axis]}; {bias} may do more harm than good"
 
@@ -234,12 +234,12 @@ def _shown_std(found: _Evidence, prior: BiasPrior) -> Vector6:
     return np.asarray(np.sqrt(prior.std**2 + DEPENDENT**2 * found.variance + AT_REST_STD**2))
 
 
-def _other_bias(found: _Evidence, prior: BiasPrior, most: Vector6) -> Iterator[str]:
+def _other_bias(found: _Evidence, prior: BiasPrior, maximum: Vector6) -> Iterator[str]:
     """Sentences on biases that are not those of a prior."""
     deviations = _deviations(found, prior)
     for sensor, unit, columns in (("gyro", "rad/s", slice(0, 3)), ("accelerometer", "m/s²", slice(3, 6))):
         axis = int(np.argmax(deviations[columns])) + columns.start
-        if deviations[axis] > most[axis]:
+        if deviations[axis] > maximum[axis]:
             yield (
                 f"the {sensor}'s bias about {'xyz'[axis % 3]} differs by {found.difference[axis]:+.2g} {unit} from the training"
                 f" runs, {deviations[axis]:.0f} standard deviations: another unit, or another turn-on"
@@ -248,30 +248,30 @@ def _other_bias(found: _Evidence, prior: BiasPrior, most: Vector6) -> Iterator[s
 
 def _disagreement(found: _Evidence, none: _Evidence) -> Iterator[str]:
     """Sentence on samples that contradict each other after the correction, unless those of no model do."""
-    if found.surprising > MOST_SURPRISING + none.surprising:  # fast vehicles surprise without a model, too
+    if found.surprising > MAX_SURPRISING + none.surprising:  # fast vehicles surprise without a model, too
         half_seconds = f"{found.surprising:.0%} of the half seconds, before it in {none.surprising:.0%}"
         yield f"gyro and gravity disagree after the correction in {half_seconds}"
 
 
 def _refuted(share: Share) -> Iterator[str]:
     """Sentence on a correction of which the log shows less than half."""
-    if LEAST_SHARE < share.value < max(HALF - SURE * share.std, min(HALF, 1.0 - OWN * share.std)):
+    if MIN_SHARE < share.value < max(HALF - SURE * share.std, min(HALF, 1.0 - OWN * share.std)):
         yield f"{_shown_share(share)}: the correction is another unit's"
 
 
 def _shown_share(share: Share) -> str:
     """Share of the correction that the log shows, in words."""
-    deviation = f" ± {share.std:.0%}" if share.std >= LEAST_SHOWN else ""
+    deviation = f" ± {share.std:.0%}" if share.std >= MIN_SHOWN else ""
     return f"gravity and stops show {share.value:.0%}{deviation} of the model's correction in motion"
 
 
 def _worse_than_none(samples: Samples, used: BiasPrior, found: _Evidence, prior: BiasPrior, none: _Evidence) -> list[str]:
     """Sentences on a model that explains a log worse than no model, even from its start in that log."""
-    shown = found.variance < MOST_CHANGE**2 / MOST_DEVIATIONS**2
-    if (shown & (np.abs(found.difference) > MOST_CHANGE + MOST_DEVIATIONS * prior.std)).any():
+    shown = found.variance < MAX_CHANGE**2 / MAX_DEVIATIONS**2
+    if (shown & (np.abs(found.difference) > MAX_CHANGE + MAX_DEVIATIONS * prior.std)).any():
         return ["no turn-on changes the bias by so much: the log is of another unit"]
     evidence = _evidence([samples], [used])[0].log_likelihood - none.log_likelihood
-    if evidence > LEAST_EVIDENCE:
+    if evidence > MIN_EVIDENCE:
         return []
     return [f"the raw samples agree with gravity and stops better than the corrected, by {-evidence:.0f} in log-likelihood"]
 
@@ -292,8 +292,8 @@ def _same_unit(model: BiasModel, about: Mapping[str, str]) -> bool:
 
 def _agreement(found: _Evidence, prior: BiasPrior, share: Share) -> str:
     """Sentence on a log that agrees with a model, and on what it does not show."""
-    most = f"{_deviations(found, prior).max():.1f} standard deviations"
-    agrees = f"the bias that the log shows lies within {most} of the training runs"
+    maximum = f"{_deviations(found, prior).max():.1f} standard deviations"
+    agrees = f"the bias that the log shows lies within {maximum} of the training runs"
     if math.isinf(share.std):  # nothing is corrected in motion
         return agrees
     return f"{agrees}; {_shown_share(share) if share.std <= HALF else 'it does not show the share of the correction in motion'}"

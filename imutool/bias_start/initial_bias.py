@@ -39,14 +39,14 @@ from imutool.bias_start.bias_tracking import (
     smooth_blocks,
 )
 from imutool.bias_start.prior_width import USUAL_WALK, BiasPrior, LeastWidth, shown_bias, std_before, supported_std
-from imutool.bias_start.stretches import MOST, StretchClock, measured
+from imutool.bias_start.stretches import MAX, StretchClock, measured
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.inertial_filter import FilterSettings
 from imutool.recording import Imu, seconds
 from imutool.recording.columns import converted
 
 AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and a tilt of the sensor
-LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # with a prior of zero variance nothing could be estimated
+MIN_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # with a prior of zero variance nothing could be estimated
 SESSION_GAP_S = 6 * 3600.0  # a longer pause is another switching-on
 NOT_SWITCHED = 0.5  # probability that a sensor stayed on within these hours
 PRIOR, TRACKED_BY = "prior of the training runs", "gravity in motion and every stop"
@@ -66,7 +66,7 @@ class InitialBias:
 
     It is valid for the whole log, unless `track` or `follows` is set. `track` is the rest bias over time. `follows` is the
     prior before the first sample: the rest bias is then tracked from `hold_s` seconds after the first sample, and before
-    them it is `track` or `rest`. With `least`, the standard deviation of a prior lies between that and `std`.
+    them it is `track` or `rest`. With `minimum`, the standard deviation of a prior lies between that and `std`.
     """
 
     rest: Vector6
@@ -76,7 +76,7 @@ class InitialBias:
     track: BiasTrajectory | None = None
     follows: BiasPrior | None = None
     hold_s: float = 0.0
-    least: LeastWidth | None = None
+    minimum: LeastWidth | None = None
 
     def __post_init__(self) -> None:
         for name in ("rest", "std", "noise"):
@@ -97,8 +97,8 @@ class InitialBias:
 
     def _tracked(self, model: BiasModel) -> TrackedBiasStream | TrajectoryBiasStream | None:
         if self.follows is not None:
-            held = self.track or BiasTrajectory(np.zeros(1), self.rest[None], self.std[None])
-            return TrackedBiasStream(model, self.follows, held, self.hold_s)
+            track = self.track or BiasTrajectory(np.zeros(1), self.rest[None], self.std[None])
+            return TrackedBiasStream(model, self.follows, track, self.hold_s)
         if self.track is not None:
             return TrajectoryBiasStream(model, self.track)
         return None
@@ -115,7 +115,7 @@ class ConstantBiasStream:
     def __init__(self, model: BiasModel, rest: Vector6, std: Vector6) -> None:
         self._stream = model.stream(rest)
         self._P, self._t_s, self._before_s = np.diag(std**2), 0.0, 0.0
-        self._most = np.maximum(std, model.prior_std) ** 2
+        self._maximum = np.maximum(std, model.prior_std) ** 2
         self._transition = _transition(model.rest_dynamics() * STEP_S)
         self._walk = np.diag(model.walk_std**2) * STEP_S
 
@@ -148,7 +148,7 @@ class ConstantBiasStream:
         """Add the random walk of whole steps up to a time, no more than the variance of a run's bias; nothing drifts."""
         steps = max(0.0, (t_s - self._t_s) // STEP_S)
         variance = np.diag(self._P)
-        self._P = self._P + np.diag(np.minimum(steps * np.diag(self._walk), np.maximum(self._most - variance, 0.0)))
+        self._P = self._P + np.diag(np.minimum(steps * np.diag(self._walk), np.maximum(self._maximum - variance, 0.0)))
         self._t_s += steps * STEP_S
 
 
@@ -166,14 +166,14 @@ def prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
 
     Within a session's hours the sensor may or may not have been switched on again: then its width is the most, else the least.
     """
-    mean, std, least = model.prior_mean.copy(), model.prior_std.copy(), model.card.get("turn_on_least_std")
+    mean, std, minimum = model.prior_mean.copy(), model.prior_std.copy(), model.card.get("turn_on_least_std")
     sessions = [] if first_ns is None else model.card.get("sessions", [])
-    apart = [max(0, session["start_ns"] - first_ns, first_ns - session["end_ns"]) for session in sessions]
-    if apart and min(apart) <= SESSION_GAP_S * 1e9:
-        session = sessions[apart.index(min(apart))]
+    distance_ns = [max(0, session["start_ns"] - first_ns, first_ns - session["end_ns"]) for session in sessions]
+    if distance_ns and min(distance_ns) <= SESSION_GAP_S * 1e9:
+        session = sessions[distance_ns.index(min(distance_ns))]
         mean, repeated = np.array(session["mean"]), LeastWidth(np.array(session["std"]), NOT_SWITCHED)
-        return InitialBias(mean, np.maximum(std, repeated.std), PRIOR, least=repeated)
-    return InitialBias(mean, std, PRIOR, least=None if least is None else LeastWidth(np.array(least)))
+        return InitialBias(mean, np.maximum(std, repeated.std), PRIOR, minimum=repeated)
+    return InitialBias(mean, std, PRIOR, minimum=None if minimum is None else LeastWidth(np.array(minimum)))
 
 
 def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
@@ -185,16 +185,16 @@ def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
     ground = np.maximum(model.rest_std, AT_REST_STD)
     walk = np.repeat(np.sqrt(np.mean(model.walk_std.reshape(2, 3) ** 2, axis=1)), 3)
     walk = np.where(walk > 0, walk, USUAL_WALK)
-    least = None if start.least is None else start.least._replace(std=np.maximum(start.least.std, LEAST_STD))
+    minimum = None if start.minimum is None else start.minimum._replace(std=np.maximum(start.minimum.std, MIN_STD))
     speed = model.card.get("speed", {} if "logs" in model.card else UNKNOWN_BODY)
     settings = FilterSettings(gyro_scale=model.card.get("turn_error", FilterSettings().gyro_scale), **speed)
-    return BiasPrior(start.rest, np.maximum(start.std, LEAST_STD), ground, walk, least, settings)
+    return BiasPrior(start.rest, np.maximum(start.std, MIN_STD), ground, walk, minimum, settings)
 
 
 def tracked_from_prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
     """Prior bias, tracked from the first sample on: for a live node, which cannot look ahead."""
     start = prior(model, first_ns)
-    std = std_before(start.std, start.least)
+    std = std_before(start.std, start.minimum)
     how = f"{training_source(model)}, {accuracy(std)}, then {TRACKED_BY}"
     return InitialBias(start.rest, std, how, follows=bias_prior(model, first_ns))
 
@@ -229,7 +229,7 @@ def from_numbers(text: str) -> InitialBias:
         rest = np.array([float(word) for word in text.split(",")])
     except ValueError:
         rest = np.zeros(0)
-    if rest.shape != (6,) or not (np.abs(rest) <= MOST).all():
+    if rest.shape != (6,) or not (np.abs(rest) <= MAX).all():
         raise ConfigError(f"{text!r}", where="init", expected=f"{', '.join(METHODS)} or gx,gy,gz,ax,ay,az")
     return InitialBias(rest, np.zeros(6), "given")
 
@@ -249,7 +249,7 @@ def accuracy(std: Vector6) -> str:
 
 
 def relative_samples(imu: Imu) -> Samples:
-    """Measured samples with seconds since the first; a long gap counts as `MOST_GAP_S`."""
+    """Measured samples with seconds since the first; a long gap counts as `MAX_GAP_S`."""
     good = measured(imu.gyro, imu.accel)
     imu = imu if good.all() else imu.rows(good)
     return seconds(StretchClock()(imu.t_ns), int(imu.t_ns[0]) if len(imu) else 0), imu.gyro, imu.accel
@@ -280,7 +280,7 @@ def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) 
     than a block.
     """
     found = _smoothed(model, batches, prior)
-    std = supported_std(prior.std, prior.least, found.difference, found.variance)
+    std = supported_std(prior.std, prior.minimum, found.difference, found.variance)
     kept = np.array_equal(std, prior.std)
     return found if kept else found._replace(track=_smoothed(model, batches, replace(prior, std=std)).track)
 

@@ -14,18 +14,18 @@ from imutool.cleaning.likelihood import axis_names, signed_permutations
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State
 
-MOST_CHANGE = np.array([0.05] * 3 + [0.7] * 3)  # rad/s and m/s²: no switching-on changes one sensor's bias by more
-MOST_DEVIATIONS = 5.0  # between a log's bias and the prior; training logs up to 3.1, other sensors from 6.7 on
+MAX_CHANGE = np.array([0.05] * 3 + [0.7] * 3)  # rad/s and m/s²: no switching-on changes one sensor's bias by more
+MAX_DEVIATIONS = 5.0  # between a log's bias and the prior; training logs up to 3.1, other sensors from 6.7 on
 TELLING = np.array([0.02] * 3 + [0.2] * 3)  # rad/s and m/s²: bias by which sensors differ, to be seen in the log
 USUAL_WALK = np.array([1e-4] * 3 + [2e-3] * 3)  # of a sensor whose training logs show no more
 BIASES = slice(inertial_filter.BIAS.start, inertial_filter.GROUND.stop)  # both biases in the filter's error
 BIAS_ROWS = np.eye(12)[:6]  # d(bias)/d(error of both biases)
-LEAST_SHOWN = 0.2  # precision from the log, of that of the prior, below which the log says nothing about the prior
+MIN_SHOWN = 0.2  # precision from the log, of that of the prior, below which the log says nothing about the prior
 SAME_WIDTH = 1e-6  # share of a variance by which a narrower prior differs at least
 SHARES = np.linspace(0.0, 1.0, 25)[:, None]  # of the way from the least width of a prior to the most, in equal ratios
 TURNED = 20.0  # chi-square that turned axes leave at most, and by which they are better
-MOST_LEFT = 0.2  # share of chi-square that turned axes leave; of sensors that were turned up to 0.16, by chance 0.28
-FEW_SESSIONS, MOST_LEFT_OF_FEW = 3, 0.12  # few say little of the next one; TUM-VI's turned sensor, of one session, leaves 0.11
+MAX_LEFT = 0.2  # share of chi-square that turned axes leave; of sensors that were turned up to 0.16, by chance 0.28
+FEW_SESSIONS, MAX_LEFT_OF_FEW = 3, 0.12  # few say little of the next one; TUM-VI's turned sensor, of one session, leaves 0.11
 CONTRADICTED = (np.inf, 10.8, 13.8, 16.3)  # chi-square of as many differences; a true prior exceeds it once in a thousand logs
 
 
@@ -45,7 +45,7 @@ class BiasPrior:
 
     Bias b in motion, offset at rest (mean zero), and random walk of b.
 
-    `walk` is in rad/s and m/s² per second^1/2, `settings` are those of its filter. With `least` the standard deviation of b
+    `walk` is in rad/s and m/s² per second^1/2, `settings` are those of its filter. With `minimum` the standard deviation of b
     is only known to lie between that and `std`: the log decides (`supported_std`). Without `stops` rest is taken for motion.
     """
 
@@ -53,7 +53,7 @@ class BiasPrior:
     std: Vector6
     ground_std: Vector6
     walk: Vector6 = field(default_factory=USUAL_WALK.copy)
-    least: LeastWidth | None = None
+    minimum: LeastWidth | None = None
     settings: FilterSettings = field(default_factory=FilterSettings)
     stops: bool = True
 
@@ -66,11 +66,11 @@ class BiasPrior:
         """
         bias, ground = (np.array([getattr(state, part) for state in states]) for part in ("bias", "ground"))
         P = np.array([state.P[BIASES, BIASES] for state in states])
-        if self.least is not None:
+        if self.minimum is not None:
             walked = self.walk**2 * elapsed_s[:, None]
             wide = self.std**2 + walked
             difference, variance = shown_bias(bias, P[:, range(6), range(6)], self.mean, wide)
-            narrow = supported_std(self.std, self.least, difference, variance) ** 2 + walked
+            narrow = supported_std(self.std, self.minimum, difference, variance) ** 2 + walked
             narrow = np.minimum(narrow, wide * (1.0 - SAME_WIDTH))
             K, P = inertial_filter.gain(P, BIAS_ROWS, narrow * wide / (wide - narrow))
             moved = (K @ (bias - self.mean)[..., None])[..., 0]
@@ -87,10 +87,10 @@ class BiasPrior:
 
         Each width w shows the mean d g and the variance w^2 (1 - g) with g = w^2 / (w^2 + v).
         """
-        assert self.least is not None
+        assert self.minimum is not None
         std, out = widened(self.std, difference, variance), np.ones_like(difference)
         for columns in COLUMNS.values():
-            width, weight = _possible_widths(std, self.least, difference, variance, columns)
+            width, weight = _possible_widths(std, self.minimum, difference, variance, columns)
             square, d, v = width**2, difference[:, None, columns], variance[:, None, columns]
             usual = narrow[:, None, columns]
             gain, usual_gain = square / (square + v), usual / (usual + v)
@@ -111,21 +111,21 @@ def shown_bias(
     the log shows little.
     """
     precision = 1.0 / after - 1.0 / before
-    measured = precision > LEAST_SHOWN / before
+    measured = precision > MIN_SHOWN / before
     gain = np.where(measured, 1.0 - after / before, 1.0)
     return (bias - mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)
 
 
-def most_left(sessions: int) -> float:
+def max_left(sessions: int) -> float:
     """Share of chi-square that turned axes leave at most, by the known sessions."""
-    return MOST_LEFT_OF_FEW if 1 <= sessions <= FEW_SESSIONS else MOST_LEFT
+    return MAX_LEFT_OF_FEW if 1 <= sessions <= FEW_SESSIONS else MAX_LEFT
 
 
-def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, most_left: float, *, confirmed: bool = False) -> list[str]:
+def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, max_left: float, *, confirmed: bool = False) -> list[str]:
     """Sentence on a log whose bias is clearly that of the training runs in turned axes.
 
     A correction of scales is the same in axes that are turned by half a turn, so the share of it says nothing about these. If
-    it is `confirmed`, there are no other turns. `most_left` is the share of chi-square that turned axes leave at most: less,
+    it is `confirmed`, there are no other turns. `max_left` is the share of chi-square that turned axes leave at most: less,
     where few logs show how much the bias changes by itself.
     """
     rotations = signed_permutations()[np.linalg.det(signed_permutations()) > 0.0]  # the identity first
@@ -134,7 +134,7 @@ def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, most_left: flo
     turned = (rotations[:, None] @ mean.reshape(2, 3, 1)).reshape(-1, 6)
     chi_square = (((mean + difference - turned) / std) ** 2).sum(axis=1)
     best = int(np.argmin(chi_square))
-    if chi_square[best] > min(TURNED, most_left * chi_square[0]) or chi_square[0] - chi_square[best] < TURNED:
+    if chi_square[best] > min(TURNED, max_left * chi_square[0]) or chi_square[0] - chi_square[best] < TURNED:
         return []
     return [
         f"its bias is that of the training logs if its x, y, z are their {axis_names(rotations[best])}: the axes are turned"
@@ -147,12 +147,12 @@ def contradicted_start(rest: Vector6, std: Vector6, shown: Vector6, shown_std: V
     sentences = []
     for sensor, unit, columns in (("gyro", "rad/s", slice(0, 3)), ("accelerometer", "m/s²", slice(3, 6))):
         axis = int(np.argmax(off[columns] / total[columns])) + columns.start
-        if off[axis] > MOST_DEVIATIONS * total[axis]:
+        if off[axis] > MAX_DEVIATIONS * total[axis]:
             seen = f"{shown[axis]:+.2g} ± {shown_std[axis]:.1g} {unit}"
             sentences.append(
                 f"the start's bias of the {sensor} about {'xyz'[axis % 3]} is {rest[axis]:+.2g}, the log shows {seen}"
             )
-    return sentences, bool((off - np.abs(shown) > TELLING + MOST_DEVIATIONS * total).any())
+    return sentences, bool((off - np.abs(shown) > TELLING + MAX_DEVIATIONS * total).any())
 
 
 def untold_bias(mean: Vector6, std: Vector6) -> str:
@@ -162,9 +162,9 @@ def untold_bias(mean: Vector6, std: Vector6) -> str:
     does not show such a bias of the gyro, its small biases tell nothing: most sensors have them.
     """
     size = np.abs(mean)
-    large = size > MOST_CHANGE
+    large = size > MAX_CHANGE
     axis = int(np.argmax(np.where(large, size, 0.0)[:3]))
-    if large[axis] and not (large & (std < size / MOST_DEVIATIONS)).any():
+    if large[axis] and not (large & (std < size / MAX_DEVIATIONS)).any():
         bias = f"the gyro's bias about {'xyz'[axis]}, {mean[axis]:+.2g} rad/s in the training runs"
         return f"the log neither shows {bias}, nor names its sensor: on another one, it does harm"
     nothing = "the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor"
@@ -173,7 +173,7 @@ def untold_bias(mean: Vector6, std: Vector6) -> str:
 
 def supported_std(
     std: Vector6,
-    least: LeastWidth | None,
+    minimum: LeastWidth | None,
     difference: Float64[np.ndarray, "*batch 6"],
     variance: Float64[np.ndarray, "*batch 6"],
 ) -> Float64[np.ndarray, "*batch 6"]:
@@ -185,38 +185,38 @@ def supported_std(
     not believed. The result is the mean of that logarithm, given the log.
     """
     out = widened(std, difference, variance)
-    if least is None:
+    if minimum is None:
         return out
     for columns in COLUMNS.values():
-        _, weight = _possible_widths(out, least, difference, variance, columns)
-        most, mean_share = out[..., columns], (weight * SHARES).sum(axis=-2)
-        out[..., columns] = np.minimum(least.std[columns], most) ** (1.0 - mean_share) * most**mean_share
+        _, weight = _possible_widths(out, minimum, difference, variance, columns)
+        maximum, mean_share = out[..., columns], (weight * SHARES).sum(axis=-2)
+        out[..., columns] = np.minimum(minimum.std[columns], maximum) ** (1.0 - mean_share) * maximum**mean_share
     return out
 
 
-def std_before(std: Vector6, least: LeastWidth | None) -> Vector6:
+def std_before(std: Vector6, minimum: LeastWidth | None) -> Vector6:
     """Standard deviation of a bias of which a log shows nothing: over all widths of its prior.
 
     It is the most where nothing says how probable the least is.
     """
-    if least is None or not least.probability:
+    if minimum is None or not minimum.probability:
         return std
     out, nothing = std.copy(), (np.zeros(6), np.full(6, np.inf))
     for columns in COLUMNS.values():
-        width, weight = _possible_widths(std, least, *nothing, columns)
+        width, weight = _possible_widths(std, minimum, *nothing, columns)
         out[columns] = np.sqrt((weight * width**2).sum(axis=-2))
     return out
 
 
 def _possible_widths(
-    std: Rows6, least: LeastWidth, difference: Rows6, variance: Rows6, columns: slice
+    std: Rows6, minimum: LeastWidth, difference: Rows6, variance: Rows6, columns: slice
 ) -> tuple[Float64[np.ndarray, "*batch widths 3"], Float64[np.ndarray, "*batch widths 1"]]:
     """Widths of a sensor's prior from the least to the most, and their probabilities given what the log shows."""
-    most, square, noise = std[..., None, columns], difference[..., None, columns] ** 2, variance[..., None, columns]
+    maximum, square, noise = std[..., None, columns], difference[..., None, columns] ** 2, variance[..., None, columns]
     shown = np.isfinite(noise)
-    width = np.minimum(least.std[columns], most) ** (1.0 - SHARES) * most**SHARES
-    before = np.full(SHARES.shape, 1.0 - least.probability)
-    before[0] += least.probability * len(SHARES)
+    width = np.minimum(minimum.std[columns], maximum) ** (1.0 - SHARES) * maximum**SHARES
+    before = np.full(SHARES.shape, 1.0 - minimum.probability)
+    before[0] += minimum.probability * len(SHARES)
     expected = width**2 + np.where(shown, noise, 1.0)
     log_likelihood = -0.5 * np.where(shown, square / expected + np.log(expected), 0.0).sum(axis=-1, keepdims=True)
     weight = before * np.exp(log_likelihood - log_likelihood.max(axis=-2, keepdims=True))

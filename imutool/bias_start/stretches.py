@@ -1,7 +1,7 @@
 """Split samples into stretches at jumps of the clock, and leave out what is no measurement.
 
 Filters cost by samples and their times stay small: a step of the stamps of more than `GAP_S`, or back by as much, begins a new
-stretch, and counts as at most `MOST_GAP_S`.
+stretch, and counts as at most `MAX_GAP_S`.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from imutool.mcap_io.read import read_recordings
 from imutool.mcap_io.temperature import with_temperatures
 from imutool.mcap_io.topics import CLEAN_FIX, UNSET_FIX
 from imutool.recording import GRAVITY_M_S2, Imu, Recording, nanoseconds, seconds
-from imutool.recording.columns import MOST_GAP_S, jump_warnings, quantile
+from imutool.recording.columns import MAX_GAP_S, jump_warnings, quantile
 
-MOST = np.array([1e4] * 3 + [1e6] * 3)  # rad/s and m/s²: no gyro or accelerometer measures more
-LEAST_FORCE_M_S2 = 1e-9  # on some axis: even in free fall a sensor's noise exceeds it
+MAX = np.array([1e4] * 3 + [1e6] * 3)  # rad/s and m/s²: no gyro or accelerometer measures more
+MIN_FORCE_M_S2 = 1e-9  # on some axis: even in free fall a sensor's noise exceeds it
 GRAVITY_RANGE = (0.4, 2.5)  # of the median specific force to gravity; a sensor in g has 0.1, a racing drone up to 2
-MOST_STRETCHES = 1000  # that a report lists
+MAX_STRETCHES = 1000  # that a report lists
 AT_ONCE = 1 << 13  # samples
 NOT_FINITE, OUT_OF_RANGE, ZERO_FORCE = "not_finite", "out_of_range", "zero_force"
 
@@ -44,7 +44,7 @@ Rows3 = Float64[np.ndarray, "n 3"]
 class Stretch(NamedTuple):
     """Beginning of a stretch: its first stamp, and the step to it (negative: set back).
 
-    On the filters' clock a step counts as at most `MOST_GAP_S`: beyond, the time says nothing about the bias.
+    On the filters' clock a step counts as at most `MAX_GAP_S`: beyond, the time says nothing about the bias.
     """
 
     start_ns: int
@@ -53,7 +53,7 @@ class Stretch(NamedTuple):
     @property
     def jump(self) -> bool:
         """Whether the clock jumped, rather than paused."""
-        return not 0.0 < self.step_s <= MOST_GAP_S
+        return not 0.0 < self.step_s <= MAX_GAP_S
 
 
 def unusual_gravity(accel: Rows3) -> str:
@@ -70,8 +70,8 @@ def unmeasured(gyro: Rows3, accel: Rows3) -> Mapping[str, Bool[np.ndarray, " n"]
     u = np.concatenate([gyro, accel], axis=1)
     size = np.abs(u)
     not_finite = ~np.isfinite(u).all(axis=1)
-    out_of_range = ~not_finite & (size > MOST).any(axis=1)
-    zero = ~not_finite & ~out_of_range & (size[:, 3:].max(axis=1, initial=0.0) < LEAST_FORCE_M_S2)
+    out_of_range = ~not_finite & (size > MAX).any(axis=1)
+    zero = ~not_finite & ~out_of_range & (size[:, 3:].max(axis=1, initial=0.0) < MIN_FORCE_M_S2)
     return {NOT_FINITE: not_finite, OUT_OF_RANGE: out_of_range, ZERO_FORCE: zero}
 
 
@@ -112,11 +112,11 @@ def measured_imu(imu: Imu, where: str, *, free_fall: bool = False) -> Imu:
 def measured_recording(recording: Recording, *, free_fall: bool = False) -> Recording:
     """A recording without the IMU samples that are no measurement, or repeat the one before."""
     imu = measured_imu(recording.imu, recording.name, free_fall=free_fall)
-    again = repeated(np.concatenate([imu.gyro, imu.accel], axis=1))
-    if again.any():
+    repeats = repeated(np.concatenate([imu.gyro, imu.accel], axis=1))
+    if repeats.any():
         stuck = f"{recording.name}: the sensor was stuck: %d samples that repeat the one before are left out, from %.3f s on"
-        logger.warning(stuck, again.sum(), seconds(imu.t_ns[again][:1], int(imu.t_ns[0]))[0])
-        imu = imu.rows(~again)
+        logger.warning(stuck, repeats.sum(), seconds(imu.t_ns[repeats][:1], int(imu.t_ns[0]))[0])
+        imu = imu.rows(~repeats)
     return replace(recording, imu=imu)
 
 
@@ -125,13 +125,13 @@ def within_range(recording: Recording) -> Recording:
 
     A model would learn another scale from them. Those of the accelerometer stay, because the gyro's windows need them.
     """
-    imu, told = recording.imu, "%s: %d of %d samples have the %s at the end of its range, %s"
+    imu, text = recording.imu, "%s: %d of %d samples have the %s at the end of its range, %s"
     gyro, accel = (np.logical_or.reduce([at_limit(column) for column in x.T]) for x in (imu.gyro, imu.accel))
     if accel.any():
-        logger.warning(told, recording.name, accel.sum(), len(imu), "accelerometer", "from which its model learns too little")
+        logger.warning(text, recording.name, accel.sum(), len(imu), "accelerometer", "from which its model learns too little")
     if not gyro.any():
         return recording
-    logger.warning(told, recording.name, gyro.sum(), len(imu), "gyro", "and are left out")
+    logger.warning(text, recording.name, gyro.sum(), len(imu), "gyro", "and are left out")
     return replace(recording, imu=imu.rows(~gyro))
 
 
@@ -154,7 +154,7 @@ def read_stretches(path: Location, *, imu: str | None = None, truth: str | None 
     """
     with Log(path) as log:
         whole = with_temperatures(read_recordings(log, imu=imu, truth=truth, vectors=False), log)
-    parts = [part for one in whole for part in one.between_jumps()]
+    parts = [part for stretch in whole for part in stretch.between_jumps()]
     found = [part for part in parts if len(part.imu) > 1 and (any(map(len, part.truths.values())) or not part.truths)]
     if len(found) < len(parts) > 1:
         logger.warning("%s: %d stretches of its clock hold no poses, and are left out", path, len(parts) - len(found))
@@ -181,7 +181,7 @@ class StretchClock:
             return stamp_ns
         before = np.int64(stamp_ns[0] - 1 if self._last_ns is None else self._last_ns)
         step = np.diff(stamp_ns, prepend=before)
-        gap_ns, most_ns = nanoseconds(GAP_S), nanoseconds(MOST_GAP_S)
+        gap_ns, max_ns = nanoseconds(GAP_S), nanoseconds(MAX_GAP_S)
         wrong = (step <= 0) & (step > -gap_ns)
         if wrong.any():
             row = int(np.argmax(wrong))
@@ -193,12 +193,12 @@ class StretchClock:
                 fix=CLEAN_FIX if stamp_ns[row] else UNSET_FIX,
             )
         begins = np.flatnonzero((step > gap_ns) | (step < 0))
-        self.stretches += [Stretch(int(stamp_ns[k]), float(step[k]) * 1e-9) for k in begins[:MOST_STRETCHES]]
-        del self.stretches[MOST_STRETCHES:]
+        self.stretches += [Stretch(int(stamp_ns[k]), float(step[k]) * 1e-9) for k in begins[:MAX_STRETCHES]]
+        del self.stretches[MAX_STRETCHES:]
         self.count, self._last_ns = self.count + len(step), int(stamp_ns[-1])
         if not len(begins):  # as nearly always
             return np.asarray(stamp_ns - self._removed_ns)
-        kept = np.where((step > most_ns) | (step < 0), most_ns, step)
+        kept = np.where((step > max_ns) | (step < 0), max_ns, step)
         removed = self._removed_ns + np.cumsum(step - kept)
         self._removed_ns = int(removed[-1])
         return np.asarray(stamp_ns - removed)

@@ -195,11 +195,11 @@ def _concealed_effect(
     parameters = {}
     for k, parameter in enumerate(model.parameters):
         value = came_to.get(parameter.name, float(theta[k]))
-        least = None if std is None or not np.isfinite(std[k]) else float(std[k])
+        minimum = None if std is None or not np.isfinite(std[k]) else float(std[k])
         scale = max(abs(value), parameter.plausible * (factor if parameter.amount else 1.0))
-        known = value != 0.0 if std is None else (least is not None and least < scale / 3.0)
+        known = value != 0.0 if std is None else (minimum is not None and minimum < scale / 3.0)
         identifiable = bool(known and abs(value) < NO_LIMIT and not parameter.name.startswith("phase"))
-        parameters[parameter.name] = TrueParameter(value, parameter.unit, scale, least, identifiable)
+        parameters[parameter.name] = TrueParameter(value, parameter.unit, scale, minimum, identifiable)
     return ConcealedEffect(model.name, model.signal, model.driver, model.equation, factor, parameters)
 
 

@@ -283,6 +283,6 @@ def unknown(rng: Generator, form: str | None) -> tuple[Model, Theta]:
         return out
 
     text = equation.format(i=AXES[i], j=AXES[(i + 1) % 3])
-    said = f"{output}.{AXES[out_axis]} += {text}"
-    model = Model("unknown", Stage.SENSOR, output, (Parameter("c", unit, large),), act, equation=said)
+    sentence = f"{output}.{AXES[out_axis]} += {text}"
+    model = Model("unknown", Stage.SENSOR, output, (Parameter("c", unit, large),), act, equation=sentence)
     return model, np.array([large * rng.choice([-1.0, 1.0])])

@@ -1,6 +1,6 @@
 """Detectability of a misfit.
 
-Against noise, beside the bias and similar effects (Fisher's information).
+Against noise, given the bias and similar effects (Fisher's information).
 
 For white Gaussian noise the information that samples hold on parameters is J^T J, J the signal's derivatives over the noise;
 nuisances (a constant bias, another effect) are projected out of J. A misfit m that the noise hides half of the time has
@@ -95,7 +95,7 @@ Seen = TypeVar("Seen", bound=Detectability)
 
 
 def detectability(scene: Scene) -> Detectability:
-    """Detectability of misfits in a scene, beside every effect of the catalogue."""
+    """Detectability of misfits in a scene, given every effect of the catalogue."""
     return with_catalogue(Detectability(scene, scene.t_s[::DECIMATION], {}))
 
 

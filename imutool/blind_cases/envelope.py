@@ -116,11 +116,11 @@ def unseal(envelope: Path, key: Path) -> ConcealedTruth:
     Raises:
         DataError: no envelope or key, one of another case, or anything in it or in the logs was changed.
     """
-    held = read_json(envelope)
-    if held.get("schema") != SCHEMA:
-        raise DataError(f"schema {held.get('schema')!r}", where=envelope, expected=SCHEMA)
+    content = read_json(envelope)
+    if content.get("schema") != SCHEMA:
+        raise DataError(f"schema {content.get('schema')!r}", where=envelope, expected=SCHEMA)
     try:
-        contents = msgspec.convert(held, Envelope)
+        contents = msgspec.convert(content, Envelope)
         secret = bytes.fromhex(_text(key).strip())
         salt, hidden = bytes.fromhex(contents.salt), base64.b64decode(contents.sealed, validate=True)
     except (msgspec.ValidationError, ValueError, binascii.Error) as error:

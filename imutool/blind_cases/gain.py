@@ -24,7 +24,7 @@ from imutool.recording import Recording, seconds
 EDGE_S = 1.0  # at both ends, where filters settle and shifted clocks leave the log
 WITHOUT_MISFIT = {"quantization", "dropped_samples", "timestamp_jitter"}  # act on noise and stamps
 NOT_SIMULATED = {"reference_error", "vibration", "unknown"}  # their parameters alone do not say the signal
-LEAST_MISFIT = 0.02  # of the noise's power: with less than that a signal has no gain worth a ratio
+MIN_MISFIT = 0.02  # of the noise's power: with less than that a signal has no gain worth a ratio
 SIGNALS = ("gyro", "accel")
 BOTH = ("both", "imu")
 
@@ -151,7 +151,7 @@ def reported_gain(truth: ConcealedTruth, found: Findings, findings: Sequence[Rep
     for k, signal in enumerate(SIGNALS):
         best: Rms = truth.achievable[signal]
         weight = (best.rms_before / best.rms_after) ** 2 - 1.0
-        if weight > LEAST_MISFIT:
+        if weight > MIN_MISFIT:
             weights.append(weight)
             noise = truth.noise_std["real"][3 * k :][:3]
             shares.append(_reported_share(signal, float(np.sqrt(np.mean(np.square(noise)))), found, findings))
@@ -167,5 +167,5 @@ def _reported_share(signal: str, noise: float, found: Findings, findings: Sequen
     before, after = max(before for before, _ in pairs), min(after for _, after in pairs)
     floor = found.unexplained.noise_floor.get(signal) or noise
     floor = noise * (np.sqrt(3.0) if floor > noise * 3.0**0.25 else 1.0)  # of three axes together, or of one
-    most = before**2 - floor**2
-    return float(np.clip((before**2 - after**2) / most, 0.0, 1.0)) if most > 0.0 else 0.0
+    maximum = before**2 - floor**2
+    return float(np.clip((before**2 - after**2) / maximum, 0.0, 1.0)) if maximum > 0.0 else 0.0

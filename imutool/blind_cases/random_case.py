@@ -116,7 +116,7 @@ def _together(seen: Detectability, rng: Generator, kind: Kind, size: Size, effec
                 found.append((model, *at_size))
             if len(found) == count:
                 break
-        if len(found) == count and all(distinct(seen, one[:2], other[:2]) for one, other in combinations(found, 2)):
+        if len(found) == count and all(distinct(seen, first[:2], other[:2]) for first, other in combinations(found, 2)):
             acting, factors = tuple((m, theta) for m, theta, _ in found), tuple(factor for *_, factor in found)
             return Concealed(kind, size, acting, factors)
     raise _hidden(kind, size, effects)

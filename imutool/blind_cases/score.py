@@ -228,10 +228,10 @@ def _unreported(effect: ConcealedEffect, finding: ReportedFinding) -> list[str]:
 def _location_score(true: Location, located: Sequence[ReportedLocation]) -> LocationScore:
     seconds, axes = [], []
     for signal, marks in zip(SIGNALS, (true.gyro, true.accel), strict=True):
-        here = [place for place in located if place.signal in (signal, *BOTH)]
+        own = [place for place in located if place.signal in (signal, *BOTH)]
         if marks.localised:
-            seconds += list(zip(marks.seconds, _covered(len(marks.seconds), true.window_s, here), strict=True))
-        named = {axis for place in here for axis in place.axes}
+            seconds += list(zip(marks.seconds, _covered(len(marks.seconds), true.window_s, own), strict=True))
+        named = {axis for place in own for axis in place.axes}
         axes += [(marks.axes[axis], axis in named) for axis in AXES]
     both = (_f1(seconds), _f1(axes))
     known = [value for value in both if value is not None]

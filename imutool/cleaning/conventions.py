@@ -28,10 +28,10 @@ from imutool.recording.columns import median, quantile
 
 SECOND_AXIS = 0.15  # of the rate about the main axis, that about the second at least: more than a tilted mount leaks
 WINDOW = 5  # steps of 0.1 s over which the gyro must carry gravity along
-MOST_WINDOWS = 600  # evenly taken from a longer log
+MAX_WINDOWS = 600  # evenly taken from a longer log
 TURNING = 0.4  # of the turn of the liveliest tenth of the windows, that of a window that counts
 STRAIGHT_DEG = 15.0  # three deviations above a rotation between gyro and poses that leaves no other order of the axes
-LEAST_MEAN_S = 10.0  # in which a vehicle that gains 10 m/s upwards changes the mean by a tenth of gravity
+MIN_MEAN_S = 10.0  # in which a vehicle that gains 10 m/s upwards changes the mean by a tenth of gravity
 FASTEST_RAD_S = 70.0  # 4000 degrees a second: faster, a reading is in another unit
 
 
@@ -139,7 +139,7 @@ def _windows(
     if not len(starts) or not turned.max() > 0:
         return np.zeros((0, WINDOW, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64)
     use = np.flatnonzero(turned > TURNING * quantile(turned, 0.9))
-    starts = starts[use[:: max(1, -(-len(use) // MOST_WINDOWS))]]
+    starts = starts[use[:: max(1, -(-len(use) // MAX_WINDOWS))]]
     rows = starts[:, None] + np.arange(WINDOW + 1)
     smooth = (mean[:-2, 3:] + mean[1:-1, 3:] + mean[2:, 3:]) / 3.0
     between = 0.5 * (rate[rows[:, :-1]] + rate[rows[:, 1:]])
@@ -186,8 +186,8 @@ def _turns_against_poses(
         found = _gyro_against_poses(step, mean, start_ns, other)
         if found is not None and found.sole and (gyro is None or found.misfit < CLEARLY * gyro.misfit):
             rates = (_rates(step, mean, start_ns, each)[:2] for each in (other, truth))
-            left = [left_when_turned(RATES[found.unit] * measured, true) for true, measured in rates]
-            fitting += [(found, other, what)] * (left[0] < CLEARLY * left[1])
+            remaining = [left_when_turned(RATES[found.unit] * measured, true) for true, measured in rates]
+            fitting += [(found, other, what)] * (remaining[0] < CLEARLY * remaining[1])
     fitting.sort(key=lambda each: -float(np.trace(each[0].axes)))
     return [each for each in fitting if np.linalg.det(each[0].axes) > 0.0] or [(gyro, truth, "")]
 
@@ -253,8 +253,8 @@ def _force_at_poses(step: Int64[np.ndarray, " m"], accel: Float64[np.ndarray, "m
 
 
 def _mean_vertical(forces: _Forces) -> float | None:
-    """Mean specific force along the z of the poses; their own acceleration has no mean worth naming over `LEAST_MEAN_S`."""
-    if not len(forces.f) or forces.t_s[-1] - forces.t_s[0] < LEAST_MEAN_S:
+    """Mean specific force along the z of the poses; their own acceleration has no mean worth naming over `MIN_MEAN_S`."""
+    if not len(forces.f) or forces.t_s[-1] - forces.t_s[0] < MIN_MEAN_S:
         return None
     return float(quaternion.rotate(forces.q_wb, forces.f)[:, 2].mean())
 
@@ -281,8 +281,8 @@ def _accel_against_poses(
     misfits = misfits._replace(a_w=POSITIONS[unit] * misfits.a_w)
     a_w, choice = misfits.a_w, choose(misfits.sizes(1.0), blocks)
     straight = gyro is not None and gyro.as_is and (gyro.sole or gyro.straight)
-    left = np.zeros((0, 3)) if choice is None else misfits.of(1.0, choice.best)
-    if straight and is_other_world(f, q_wb, a_w, left, blocks):
+    misfit = np.zeros((0, 3)) if choice is None else misfits.of(1.0, choice.best)
+    if straight and is_other_world(f, q_wb, a_w, misfit, blocks):
         return None, None, unit, OTHER_WORLD
     in_mean = axis_of_gravity(quaternion.rotate(q_wb, f)) if straight else None
     if choice is None or choice.misfit[choice.best] > CLEARLY * GRAVITY_M_S2:

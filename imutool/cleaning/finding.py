@@ -19,7 +19,7 @@ Verdict = Literal["good", "usable", "quarantine"]
 
 JOIN = 64  # samples: defects nearer to one another than this are one interval
 MAX_INTERVALS = 100  # listed of one finding; the rest is counted
-MOST_SHOWN = 3  # of them in a table; all are in the JSON
+MAX_SHOWN = 3  # of them in a table; all are in the JSON
 CORRECTED, FLAGGED, ERROR = 0.02, 0.05, 0.3  # what a kind of finding costs the score
 
 
@@ -47,10 +47,10 @@ class Finding:
 
     def when(self, start_ns: int) -> str:
         """Times of its first intervals (s), as `0.118, 5.437–6.318 and 2 more`."""
-        ends = [tuple(f"{(ns - start_ns) * 1e-9:.3f}" for ns in interval) for interval in self.intervals_ns[:MOST_SHOWN]]
+        ends = [tuple(f"{(ns - start_ns) * 1e-9:.3f}" for ns in interval) for interval in self.intervals_ns[:MAX_SHOWN]]
         more = len(self.intervals_ns) - len(ends) + self.intervals_left_out
-        said = ", ".join(first if first == last else f"{first}–{last}" for first, last in ends)
-        return said + (f" and {more} more" if more else "") if said else "whole log"
+        text = ", ".join(first if first == last else f"{first}–{last}" for first, last in ends)
+        return text + (f" and {more} more" if more else "") if text else "whole log"
 
     def report(self, start_ns: int) -> FindingReport:
         """Report entry; seconds count from the topic's first good sample."""

@@ -14,19 +14,19 @@ from imutool.cleaning.unit_evidence import POSES_APART_NS
 from imutool.recording import seconds
 from imutool.recording.columns import median, quantile
 
-MOST_POSES = 2000  # evenly taken from a longer log
+MAX_POSES = 2000  # evenly taken from a longer log
 LONGEST_DELAY_S, FINE_S = 2.0, 0.01
 SLOW_S = 1.0  # length of the turns that find the delay: in steps of 0.1 s a fast walk fits one stride later as well
 FINE_LAGS_S = FINE_S * np.arange(-12, 13)
 REPEATED = 2.0  # times what the best delay leaves: if motion repeats, another delay may leave less; otherwise 2.6 and more
-LEAST_CORRELATION, WEAK = 0.8, 0.5  # of the whole log, and of a part
-LEAST_SHARED, MOST_STEPS = 300, 72_000  # steps of 0.1 s that two clocks share, and of a log that is searched for them
+MIN_CORRELATION, WEAK = 0.8, 0.5  # of the whole log, and of a part
+MIN_SHARED, MAX_STEPS = 300, 72_000  # steps of 0.1 s that two clocks share, and of a log that is searched for them
 SHARES = 1.0, 0.95  # of the turns that count with their own length; longer ones, as where markers are exchanged, are cut to it
 CERTAIN = 6.0  # standard deviations of Fisher's z; of 210 pairs of unrelated logs the best by chance had 5.3
 DELAY_PARTS, FEWEST_PARTS = 8, 4  # parts whose own lags show how sure the delay is
 SCALE_STEPS, GAUSS = 20, 1.4  # steps to Student's scale of a few parts, and by how much it is below a Gaussian's deviation
 SEARCHES = (LONGEST_DELAY_S, 40, DELAY_PARTS), (0.5, 20, FEWEST_PARTS)  # longest delay, poses in each part, most parts
-STEP_LEAST_S, STEP_STDS = 0.03, 8.0  # of a step of one clock, at least; and in deviations of the parts on each side
+STEP_MIN_S, STEP_STDS = 0.03, 8.0  # of a step of one clock, at least; and in deviations of the parts on each side
 STEP_CLEAR = 3.0  # of each side, the logarithm of a likelihood ratio of its own delay to the other's, with a sample each second
 
 
@@ -91,13 +91,13 @@ def _clock_difference(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3
     step, mean = motion.table()
     true_s, start_ns = seconds(first, int(first[0])) + 0.5 * seconds(truth.t_ns[1:] - first, 0), motion.middle_ns
     count = int(true_s[-1] / STEP_S) + 1, int(step[-1] - step[0]) + 1
-    if not all(LEAST_SHARED <= n <= MOST_STEPS for n in count):
+    if not all(MIN_SHARED <= n <= MAX_STEPS for n in count):
         return None
     true = np.interp(STEP_S * np.arange(count[0]), true_s, _cut(np.linalg.norm(rate, axis=1), share))
     gyro = np.interp(step[0] + np.arange(count[1]), step, _cut(np.linalg.norm(mean[:, :3] - bias, axis=1), share))
     from imutool.inertial.correlation import cross_correlation  # scipy, which poses on the IMU's clock never need
 
-    found = cross_correlation(gyro, true, LEAST_SHARED)
+    found = cross_correlation(gyro, true, MIN_SHARED)
     lag, value, sigma = found.best(np.ones(len(found.lag), bool))
     if value < WEAK or sigma < CERTAIN:
         return None
@@ -112,10 +112,10 @@ def _cut(lengths: Float64[np.ndarray, "*rows n"], share: float) -> Float64[np.nd
 def _near_delay(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"], share: float) -> Delay | None:
     """Delay of at most `LONGEST_DELAY_S`, and of less in a short log."""
     period_ns = max(STEP_NS, int(median(np.diff(truth.t_ns))))  # poses at 25 Hz are 80 and 120 ms apart here
-    apart = max(1, round(SLOW_S * 1e9 / period_ns)), 1
-    for longest_s, fewest, most_parts in SEARCHES:
-        slow, fast = (_Turns.of(motion, truth, n, period_ns, bias, longest_s, share) for n in apart)
-        count = min(most_parts, min(len(slow.size) + fewest, len(fast.size)) // fewest)  # of the slow ones a log holds fewer
+    steps = max(1, round(SLOW_S * 1e9 / period_ns)), 1
+    for longest_s, fewest, max_parts in SEARCHES:
+        slow, fast = (_Turns.of(motion, truth, n, period_ns, bias, longest_s, share) for n in steps)
+        count = min(max_parts, min(len(slow.size) + fewest, len(fast.size)) // fewest)  # of the slow ones a log holds fewer
         if count >= FEWEST_PARTS:
             return _searched(slow, fast, longest_s, count, motion.middle_ns)
     return None
@@ -129,11 +129,11 @@ def _searched(slow: _Turns, fast: _Turns, longest_s: float, count: int, start_ns
         return stepped
     whole = slowly[:, 0]
     at = _best(coarse, whole)
-    if whole[at] < LEAST_CORRELATION or at in (0, len(coarse) - 1):
+    if whole[at] < MIN_CORRELATION or at in (0, len(coarse) - 1):
         return None
     lags = coarse[at] + FINE_LAGS_S
     fine = fast.correlations(lags, count)
-    if fine[:, 0].max() < LEAST_CORRELATION:
+    if fine[:, 0].max() < MIN_CORRELATION:
         return None
     peaks = np.array([_peak(lags, column) for column in fine.T])
     parts = peaks[1:][np.isfinite(peaks[1:])]
@@ -147,9 +147,9 @@ def _best(lags: Float64[np.ndarray, " l"], values: Float64[np.ndarray, " l"]) ->
 
     A pendulum fits as well a swing later.
     """
-    left, largest = 1.0 - values**2, int(np.argmax(values))
+    remaining, largest = 1.0 - values**2, int(np.argmax(values))
     peaks = np.flatnonzero((values[1:-1] >= np.maximum(values[:-2], values[2:])) & (values[1:-1] > 0.0)) + 1
-    alike = np.append(peaks[left[peaks] <= REPEATED * left[largest]], largest)
+    alike = np.append(peaks[remaining[peaks] <= REPEATED * remaining[largest]], largest)
     return int(alike[np.argmin(np.abs(lags[alike]))])
 
 
@@ -167,7 +167,7 @@ def _stepped(
 ) -> Delay | None:
     """Delay of the larger side of a step, which parts show whose own delays are alike on each side of it alone."""
     best = [_best(coarse, column) for column in slowly.T]
-    own = np.where(slowly.max(axis=0) < LEAST_CORRELATION, np.nan, coarse[best])[1:]
+    own = np.where(slowly.max(axis=0) < MIN_CORRELATION, np.nan, coarse[best])[1:]
     parts = np.full(DELAY_PARTS, np.nan)
     for centre in {*own[np.isfinite(own)].tolist()}:  # np.unique imports numpy.ma, a sixteenth of `info`
         fine = fast.correlations(centre + FINE_LAGS_S, DELAY_PARTS)[:, 1:]
@@ -179,9 +179,9 @@ def _stepped(
         if min(map(len, sides)) == 0 or sum(map(len, sides)) < DELAY_PARTS - 2:
             continue
         before_s, after_s = (float(median(side)) for side in sides)
-        left = np.concatenate([sides[0] - before_s, sides[1] - after_s])
-        std_s = float(np.sqrt((left**2).sum() / (len(left) - 2)))
-        if abs(after_s - before_s) > max(STEP_LEAST_S, STEP_STDS * std_s) and fast.tell_apart(before_s, after_s, within):
+        residual = np.concatenate([sides[0] - before_s, sides[1] - after_s])
+        std_s = float(np.sqrt((residual**2).sum() / (len(residual) - 2)))
+        if abs(after_s - before_s) > max(STEP_MIN_S, STEP_STDS * std_s) and fast.tell_apart(before_s, after_s, within):
             at_ns = start_ns + round(1e9 * float(np.array_split(fast.first_s, DELAY_PARTS)[within][0]))
             larger = int(len(sides[1]) > len(sides[0]))
             delay_s = (before_s, after_s)[larger]
@@ -206,16 +206,16 @@ class _Turns(NamedTuple):
         cls,
         motion: Motion,
         truth: Truth,
-        apart: int,
+        spacing: int,
         period_ns: int,
         bias: Float64[np.ndarray, "3"],
         longest_s: float,
         share: float,
     ) -> _Turns:
-        """Turns between poses that are `apart` rows apart, as far as the gyro covers them at every delay."""
-        first, last, rate = turning(truth, apart)
+        """Turns between poses that are `spacing` rows apart, as far as the gyro covers them at every delay."""
+        first, last, rate = turning(truth, spacing)
         step, mean = motion.table()
-        use, first_s, last_s = usable(first, last, motion.middle_ns, step, POSES_APART_NS + (apart - 1) * period_ns)
+        use, first_s, last_s = usable(first, last, motion.middle_ns, step, POSES_APART_NS + (spacing - 1) * period_ns)
         inside = (first_s > longest_s + STEP_S * step[0]) & (last_s + longest_s < STEP_S * (step[-1] + 1))
         gyro = StepIntegral.of(step, mean[:, :3] - bias)
         return cls(_cut(np.linalg.norm(rate[use[inside]], axis=1), share), first_s[inside], last_s[inside], gyro, share)
@@ -288,5 +288,5 @@ def usable(
     """Pairs of poses less than `longest_ns` apart, inside the IMU's time: rows, ends (s)."""
     first_s, last_s = seconds(first_ns, start_ns), seconds(last_ns, start_ns)
     use = np.flatnonzero((first_s > STEP_S * step[0]) & (last_s < STEP_S * (step[-1] + 1)) & (last_ns - first_ns < longest_ns))
-    use = use[:: max(1, -(-len(use) // MOST_POSES))]
+    use = use[:: max(1, -(-len(use) // MAX_POSES))]
     return use, first_s[use], last_s[use]

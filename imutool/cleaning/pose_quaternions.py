@@ -36,19 +36,19 @@ def is_other_world(
     f_b: Float64[np.ndarray, "n 3"],
     q_wb_wxyz: Float64[np.ndarray, "n 4"],
     a_w: Float64[np.ndarray, "n 3"],
-    left: Float64[np.ndarray, "_ 3"],
+    misfit: Float64[np.ndarray, "_ 3"],
     blocks: Int64[np.ndarray, " n"],
 ) -> bool:
     """Whether quaternions and positions are of two worlds, NED and ENU, by the specific force.
 
-    The acceleration of the positions is that of f, turned by the quaternions, in the other world alone; `left` is what the best
-    reading of axes in one world leaves (m/s²).
+    The acceleration of the positions is that of f, turned by the quaternions, in the other world alone. `misfit` (m/s²) is the
+    residual of the best reading of axes in one world.
     """
-    if len(left) != len(f_b):
+    if len(misfit) != len(f_b):
         return False
     f_w = quaternion.rotate(read_right(OTHER_WORLD, q_wb_wxyz), f_b)
     up = np.array([0.0, 0.0, GRAVITY_M_S2])
-    choice = choose(np.stack([quaternion.length(x) for x in (left, a_w + up - f_w, a_w - up - f_w)]), blocks)
+    choice = choose(np.stack([quaternion.length(x) for x in (misfit, a_w + up - f_w, a_w - up - f_w)]), blocks)
     if choice is None or choice.best == 0 or choice.certain < SURE:
         return False
     return bool(choice.misfit[choice.best] < CLEARLY * choice.misfit[0])

@@ -17,7 +17,7 @@ from imutool.recording.columns import median
 POSITIONS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}  # metres of one unit
 RIVALS = 0.5, 1.0, 2.0  # of a unit: positions of no certain scale, as of one camera, fit another factor better
 WIDTHS = 1, 2, 4  # rows over which the errors are averaged: noise of positions averages out sooner than the motion
-LEAST_SHARE = 0.1  # of the squared misfit that a unit explains; noise times a factor k explains k of it at best, 0.01 in cm
+MIN_SHARE = 0.1  # of the squared misfit that a unit explains; noise times a factor k explains k of it at best, 0.01 in cm
 
 
 class Misfits(NamedTuple):
@@ -83,8 +83,8 @@ def _unit(misfits: Misfits, blocks: Int64[np.ndarray, " n"]) -> str:
     choice = choose(np.stack([*found.values()]), blocks)
     if choice is None or choice.certain < SURE:
         return ""
-    of_still, left = choice.misfit[0] ** 2, choice.misfit[choice.best] ** 2
-    return [*found][choice.best] if of_still - left > LEAST_SHARE * of_still else ""
+    of_still, of_best = choice.misfit[0] ** 2, choice.misfit[choice.best] ** 2
+    return [*found][choice.best] if of_still - of_best > MIN_SHARE * of_still else ""
 
 
 def _best(misfits: Misfits, factor: float, blocks: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"] | None:

@@ -15,9 +15,9 @@ from imutool.recording import nanoseconds
 BLOCK = 4096  # samples: what rules see at a time depends on the log alone, not on how its chunks were cut
 STEP_NS = nanoseconds(0.1)
 STEP_S = 0.1  # of `Motion`
-MOST_FRAMES = 4  # that a warning names
-MOST_COUNTED = 1000  # a hostile log names another frame in each message
-MOST_RATES = 20_000  # samples of the gyro that are kept as they are: 480 kB
+MAX_FRAMES = 4  # that a warning names
+MAX_COUNTED = 1000  # a hostile log names another frame in each message
+MAX_RATES = 20_000  # samples of the gyro that are kept as they are: 480 kB
 
 Numbers = Int64[np.ndarray, " n"]
 
@@ -50,7 +50,7 @@ def counted_frames(batches: Iterable[ImuBatch], frames: Counter[str]) -> Iterato
 def count_frame(batch: ImuBatch, frames: Counter[str]) -> None:
     """Add the messages of a batch to those of its frame."""
     frame = batch.frame_id.lstrip("/")
-    if frame in frames or len(frames) < MOST_COUNTED:
+    if frame in frames or len(frames) < MAX_COUNTED:
         frames[frame] += len(batch.stamp_ns)
 
 
@@ -59,7 +59,7 @@ def frame_words(frames: Mapping[str, int]) -> list[str]:
     named = [f"{frame} ({count})" for frame, count in frames.items() if frame]
     if len(named) < 2:
         return []
-    some = ", ".join(named[:MOST_FRAMES]) + ", …" * (len(named) > MOST_FRAMES)
+    some = ", ".join(named[:MAX_FRAMES]) + ", …" * (len(named) > MAX_FRAMES)
     return [f"the messages name {len(named)} frames: {some}; several sensors have no common bias"]
 
 
@@ -126,8 +126,8 @@ class Motion:
         if self.start_ns is None:
             self.start_ns = self.end_ns = int(samples.stamp_ns[0])
         self.end_ns = int(samples.stamp_ns[-1])
-        if self.samples < MOST_RATES:
-            self._rates.append(samples.values[: MOST_RATES - self.samples, :3].copy())
+        if self.samples < MAX_RATES:
+            self._rates.append(samples.values[: MAX_RATES - self.samples, :3].copy())
         self.samples += len(samples.number)
         step, past_ns = np.divmod(samples.stamp_ns - self.start_ns, STEP_NS)
         self._past_middle_ns += int((past_ns - STEP_NS // 2).sum())

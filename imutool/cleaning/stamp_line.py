@@ -32,7 +32,7 @@ WRAPS = {
 SECOND_NS = 1_000_000_000
 FRACTIONS = {10: "10 ns", 100: "100 ns", 1000: "us", 10_000: "10 us", 100_000: "100 us", 1_000_000: "ms"}  # units of a fraction
 FILLED = 0.9  # of a second: how far fractions reach in their own unit
-LEAST_SECONDS, LEAST_HZ = 3, 4.0  # of a log whose fractions are judged
+MIN_SECONDS, MIN_HZ = 3, 4.0  # of a log whose fractions are judged
 EVEN = 5.0  # times: most by which the step into the next second differs from the others
 OTHER_RATE = 1.25  # of a window's rate, that of the next: no crystal drifts so far
 SIDE = 4  # blocks, of a quarter of a window
@@ -175,7 +175,7 @@ def _fraction_unit(stamp_ns: Int64[np.ndarray, " n"]) -> int:
     """
     seconds, fraction = np.divmod(stamp_ns, SECOND_NS)
     into_next = np.diff(seconds) == 1
-    if into_next.sum() < LEAST_SECONDS or len(stamp_ns) < LEAST_HZ * (seconds[-1] - seconds[0]):
+    if into_next.sum() < MIN_SECONDS or len(stamp_ns) < MIN_HZ * (seconds[-1] - seconds[0]):
         return 1
     largest, smallest = int(fraction.max()), int(fraction.min())
     unit = next((u for u in FRACTIONS if FILLED * SECOND_NS <= largest * u < SECOND_NS), 1)

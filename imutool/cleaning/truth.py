@@ -94,13 +94,13 @@ def _thinned(stamp_ns: Int64[np.ndarray, " n"], last_ns: int) -> Int64[np.ndarra
 
 
 def turning(
-    truth: Truth, apart: int = 1
+    truth: Truth, spacing: int = 1
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
-    """Angular rate (rad/s, body) between poses `apart` rows apart, with start and end (ns)."""
+    """Angular rate (rad/s, body) between poses `spacing` rows apart, with start and end (ns)."""
     q_wb = quaternion.unit(truth.q_wb_wxyz)
-    first, last = truth.t_ns[:-apart], truth.t_ns[apart:]
+    first, last = truth.t_ns[:-spacing], truth.t_ns[spacing:]
     dt = seconds(last, int(truth.t_ns[0])) - seconds(first, int(truth.t_ns[0]))
-    return first, last, quaternion.log(quaternion.multiply(quaternion.inverse(q_wb[:-apart]), q_wb[apart:])) / dt[:, None]
+    return first, last, quaternion.log(quaternion.multiply(quaternion.inverse(q_wb[:-spacing]), q_wb[spacing:])) / dt[:, None]
 
 
 def axis_of_gravity(force_w: Float64[np.ndarray, "n 3"]) -> str | None:
@@ -132,8 +132,8 @@ def rotation_deg(
     """
     shared = gyro.T @ (omega @ turn.T) * (length_s / ERRORS_LAST_S / len(gyro))  # symmetric, as R is the best
     seen = np.trace(shared) * np.eye(3) - (shared + shared.T) / 2.0
-    least, _, most = np.linalg.eigvalsh(seen)
-    if least <= 1e-9 * most:  # turns about one axis alone, as of wheels
+    minimum, _, maximum = np.linalg.eigvalsh(seen)
+    if minimum <= 1e-9 * maximum:  # turns about one axis alone, as of wheels
         return None
     variance = ((gyro - omega @ turn.T) ** 2).sum(axis=1).mean() / 3.0
     std_deg = np.degrees(np.sqrt(variance * np.diag(np.linalg.inv(seen))))

@@ -84,8 +84,8 @@ def gravity_level(motion: Motion) -> tuple[float | None, bool, bool]:
     if len(calm):
         return float(quantile(level[calm], 0.5)), True, False
     length = np.linalg.norm(mean[:, 3:], axis=1)
-    least, low, middle, high = (float(quantile(length, share)) for share in (0.05, 0.25, 0.5, 0.75))
-    if not whole.any() or (high - low < STEADY_SPREAD * middle and least > GRAVITY_SHARE * middle):
+    minimum, low, middle, high = (float(quantile(length, share)) for share in (0.05, 0.25, 0.5, 0.75))
+    if not whole.any() or (high - low < STEADY_SPREAD * middle and minimum > GRAVITY_SHARE * middle):
         return middle, False, False
     median = float(quantile(level[whole], 0.5))
     calmest = float(quantile(level[np.flatnonzero(whole)[np.argsort((scatter * level)[whole])][:few]], 0.5))

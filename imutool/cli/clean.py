@@ -117,7 +117,7 @@ def show(survey: Survey) -> None:
     out.print(line, highlight=False, soft_wrap=True)
     if survey.findings:
         head = "rule", "count", "what was found", "done", "when s"
-        found = [(one.rule, str(one.count), one.what, one.action, one.when(survey.start_ns)) for one in survey.findings]
+        found = [(f.rule, str(f.count), f.what, f.action, f.when(survey.start_ns)) for f in survey.findings]
         table([head, *found], keys=1)
     for reason in survey.reasons:
         say(reason, "not to be trusted", "red")

@@ -124,11 +124,11 @@ def _tell(report: ConvertReport, common: Common) -> None:
             tell_warning(note, "note")
     for loss in _grouped(report.losses):
         tell_warning(with_flags(loss))
-    told: set[str] = set()
+    printed: set[str] = set()
     for failure in report.failures:
         first, _, others = failure.message.partition("\n")
-        tell_error(with_flags(f"{first} the same as above" if others in told else failure.message))
-        told.update(filter(None, [others]))
+        tell_error(with_flags(f"{first} the same as above" if others in printed else failure.message))
+        printed.update(filter(None, [others]))
     if report.failures or report.losses:
         raise typer.Exit(DataError.exit_code if report.failures else LOST)
 

@@ -109,8 +109,8 @@ def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
     if diagnosis.closed is not None:
         from imutool.diagnosis.closed_loop import table as closed_table
 
-        left = ", ".join(diagnosis.closed.findings) or "a misfit without a name"
-        answer = f"still missing: {left}" if diagnosis.closed.mismatch else "nothing is missing"
+        missing = ", ".join(diagnosis.closed.findings) or "a misfit without a name"
+        answer = f"still missing: {missing}" if diagnosis.closed.mismatch else "nothing is missing"
         if any(finding.signal not in (*SENSORS, "both") for finding in diagnosis.findings):
             answer += " in the IMU; effects of other signals are not simulated"
         rounds = f", after {diagnosis.closed.rounds} rounds" if diagnosis.closed.rounds > 1 else ""

@@ -53,9 +53,9 @@ def train(
 
     place, words = local(model, "model"), list[str]()
     if physics is not None:
-        words, left = _named_by(physics, method)
-        if left:
-            logging.getLogger("imutool").warning("left to the neural ODE: %s", ", ".join(left))
+        words, unread = _named_by(physics, method)
+        if unread:
+            logging.getLogger("imutool").warning("left to the neural ODE: %s", ", ".join(unread))
     words += [*(set_ or ()), *([f"seed={seed}"] if seed is not None else ())]
     refuse_twins(logs, "logs")
     settings = load(settings_of(method), config, [full_name(method, word) for word in words])

@@ -83,14 +83,14 @@ def _agreed(logs: Sequence[Corrections]) -> Corrections:
 
 def _lacks(own: Corrections, common: Corrections) -> bool:
     """Whether a log lacks a common correction, and shows no other in its place; of its delay its own motion says most."""
-    mine, theirs = _points(own), _points(common)
+    has, needs = _points(own), _points(common)
     is_turned, are_turned = not _is_identity(own.body.turn), not _is_identity(common.body.turn)
-    apart = _angle(own.body.turn, common.body.turn)
-    if any(not _alike(mine[point], theirs[point]) for point in mine.keys() & theirs.keys()):
+    angle = _angle(own.body.turn, common.body.turn)
+    if any(not _alike(has[point], needs[point]) for point in has.keys() & needs.keys()):
         return False
-    if is_turned and are_turned and apart > ALIKE_RAD:
+    if is_turned and are_turned and angle > ALIKE_RAD:
         return False
-    return bool(theirs.keys() - mine.keys()) or (are_turned and apart > SAME_RAD) or (common.late_ns != 0 and own.late_ns == 0)
+    return bool(needs.keys() - has.keys()) or (are_turned and angle > SAME_RAD) or (common.late_ns != 0 and own.late_ns == 0)
 
 
 def _points(found: Corrections) -> dict[str, str | Float64[np.ndarray, "..."]]:
@@ -123,8 +123,8 @@ def fitted_to(path: Path, common: Corrections) -> Corrections | None:
         turned = None if _is_identity(common.body.turn) else body_of(log, common.pose_topic, common.body.turn)
         frame_id = next(log.pose_batches(common.pose_topic)).frame_id
         copies = frames_of_copies(log, common.pose_topic)
-    if said := pose_notes(common.world, common.quaternions, common.unit, common.late_ns, turned):
-        notes[common.pose_topic] = f"{SAID}, {'; '.join(said)}"
+    if note := pose_notes(common.world, common.quaternions, common.unit, common.late_ns, turned):
+        notes[common.pose_topic] = f"{SAID}, {'; '.join(note)}"
     body = turned or NOT_TURNED
     return replace(common, frame_id=frame_id, body=body, copies=copies, reflected=own_types, notes=notes, kept=kept)
 

@@ -31,7 +31,7 @@ from imutool.mcap_io.storage.target import copy_file
 from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES
 from imutool.recording.message_log import Message, MessageLog
 
-MOST_ROUNDS = 4  # quaternions first, then the clock of poses, which hides a turned body, which hides a wrong world
+MAX_ROUNDS = 4  # quaternions first, then the clock of poses, which hides a turned body, which hides a wrong world
 AS_RECORDED = np.stack([np.eye(3)] * 2)  # axes of gyro and accel
 
 
@@ -85,9 +85,9 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 frame_id = next(log.pose_batches(pose_topic)).frame_id
                 notes[pose_topic] += changes
         own_types = {t: found for t in (*stamps, *imus) if isinstance(found := log.topics[t].reflected, Reflected)}
-    said = {topic: "; ".join(lines) for topic, lines in notes.items()}
+    texts = {topic: "; ".join(lines) for topic, lines in notes.items()}
     poses = world, frame_id, late_ns, body, pose_topic, unit, quaternions, copies
-    return Corrections(imus, *poses, stamps, own_types, said, kept)
+    return Corrections(imus, *poses, stamps, own_types, texts, kept)
 
 
 def _one_is_straight(log: Log, imus: Sequence[str], pose_topic: str) -> bool:
@@ -161,16 +161,16 @@ def _rounds(log: Path, wanted: Sequence[str], first: Corrections | None = None) 
     After each round a log without images and numbers, in a new folder next to `log`, shows what the next has to correct.
     """
     judged, rounds, kept = log, list[Corrections](), list[str]()
-    most = MOST_ROUNDS if CONVENTIONS in wanted else 1
+    maximum = MAX_ROUNDS if CONVENTIONS in wanted else 1
     with TemporaryDirectory(prefix="rounds-", dir=log.parent) as folder:
-        for number in range(most):
+        for number in range(maximum):
             by_setup = first if number == 0 else None
             found = find_corrections(judged, [CONVENTIONS] if number else wanted) if by_setup is None else by_setup
             kept = list(found.kept)
             if not found:
                 break
             rounds.append(found)
-            if number + 1 == most:
+            if number + 1 == maximum:
                 break
             small = Path(folder) / f"{number}_{log.name}"
             write_log(found.put_on(_judged(judged)), small, compression="none")

@@ -78,8 +78,8 @@ class Corrections:
 
     def put_on(self, content: MessageLog) -> MessageLog:
         """Log with corrected messages, and the record of what was corrected."""
-        said = [f"{topic}: {note}" for topic, note in self.notes.items()]
-        content.remarks.notes.extend(said)
+        remarks = [f"{topic}: {note}" for topic, note in self.notes.items()]
+        content.remarks.notes.extend(remarks)
         earlier = content.metadata.get(RECORD, {})  # of another round, or of an earlier command
         record = {topic: "; ".join(filter(None, (earlier.get(topic), note))) for topic, note in self.notes.items()}
         metadata = {**content.metadata, RECORD: {**earlier, **record}}
@@ -94,8 +94,8 @@ class Corrections:
             else:
                 before += 1
         if before:
-            said = f"{before} messages of poses belong before the zero of the log's clock, and are left out"
-            content.remarks.notes.append(said)
+            note = f"{before} messages of poses belong before the zero of the log's clock, and are left out"
+            content.remarks.notes.append(note)
 
     def _in_order(self, content: MessageLog) -> Iterator[Message]:
         """Corrected messages; where poses come from another clock, they are sorted in by the corrected one."""

@@ -38,7 +38,7 @@ from imutool.mcap_io.write import (
     velocity_series,
 )
 from imutool.recording import nanoseconds
-from imutool.recording.columns import MOST_GAP_S, clock_jumps, jump_warnings
+from imutool.recording.columns import MAX_GAP_S, clock_jumps, jump_warnings
 from imutool.recording.message_log import MessageLog, MessageTopic, Table, named_kind
 
 BULKY = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
@@ -48,7 +48,7 @@ ROS_NAMES = {"f4": "float32", "f8": "float64", "b1": "bool"} | {
     f"{sign}{size}": f"{name}{8 * size}" for sign, name in (("i", "int"), ("u", "uint")) for size in (1, 2, 4, 8)
 }
 LATEST_NS = 2**63 - 1  # of 64 bits with a sign, as numpy counts
-MOST_JUMPS = 1000  # of the clock, that are counted
+MAX_JUMPS = 1000  # of the clock, that are counted
 ENCAPSULATION = 4  # bytes ahead of a CDR message; alignment counts from behind them
 _encode_body = partial(encode_imu, frame_id=BODY)
 
@@ -147,7 +147,7 @@ class _Stream:
 
     def chunks(self) -> Iterator[tuple[Chunk, str | None]]:
         """Chunks of about 1 MiB as they fill, and the rest at the end."""
-        last, longest, jumps, stamps = None, nanoseconds(MOST_GAP_S), list[tuple[int, float]](), SharedStamps()
+        last, longest, jumps, stamps = None, nanoseconds(MAX_GAP_S), list[tuple[int, float]](), SharedStamps()
         before, jump = set[int](), (0, 0.0)
         for topic, log_time, publish_time, payload in self._source.messages():
             if (number := self.channels.get(topic)) is None:
@@ -155,7 +155,7 @@ class _Stream:
             if not 0 <= log_time <= LATEST_NS:
                 what, fix = f"a message of {topic.name} has the time {log_time} ns", "imutool repair leaves it out"
                 raise DataError(what, expected="a time from 1970 to 2262", fix=fix)
-            if last is not None and abs(log_time - last) > longest and len(jumps) < MOST_JUMPS:
+            if last is not None and abs(log_time - last) > longest and len(jumps) < MAX_JUMPS:
                 before, jump = set(self._begun), (log_time, (log_time - last) * 1e-9)
             if number in before:  # and no topic with a clock of its own
                 jumps, before = [*jumps, jump], set()

@@ -44,8 +44,8 @@ class SharedStamps:
             if 0 < count == self._all[name] - 1:
                 yield f"{name}: the stamps were never set; imutool convert LOG OUT --restamp takes the log times"
             elif count:
-                said = f"{count} of {self._all[name]} messages have the stamp of the one before, and other values"
-                yield f"{name}: {said}; imutool convert LOG OUT --restamp spreads them at the sensor's rate"
+                note = f"{count} of {self._all[name]} messages have the stamp of the one before, and other values"
+                yield f"{name}: {note}; imutool convert LOG OUT --restamp spreads them at the sensor's rate"
 
 
 def find_stamps(log: Log, notes: Mapping[str, list[str]]) -> dict[str, Int64[np.ndarray, "..."]]:
@@ -101,8 +101,8 @@ def _set(log_ns: Int64[np.ndarray, " n"], stamp_ns: Int64[np.ndarray, " n"]) -> 
     lags = np.sort((log_ns - stamp_ns)[stamp_ns != 0])
     if not len(lags):
         return stamp_ns
-    there = log_ns - lags[len(lags) // 2]
-    return np.where((stamp_ns == 0) & (np.abs(there) > SAME_CLOCK_NS), there, stamp_ns)
+    expected_ns = log_ns - lags[len(lags) // 2]
+    return np.where((stamp_ns == 0) & (np.abs(expected_ns) > SAME_CLOCK_NS), expected_ns, stamp_ns)
 
 
 def _unset(recorded: Int64[np.ndarray, " n"], stamp_ns: Int64[np.ndarray, " n"]) -> list[str]:

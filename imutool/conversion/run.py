@@ -86,23 +86,23 @@ def convert(
     """
     labels = Labels(sensor, parse_kinds(kinds), parse_pair(imu))
     corrected = tuple(name for name, asked in ((CONVENTIONS, fix), (STAMPS, restamp)) if asked)
-    ways = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
+    template = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
-        return _from_stream(module, source, out, sequences, replace(ways, converter=format), progress)
+        return _from_stream(module, source, out, sequences, replace(template, converter=format), progress)
     if is_stream(source) and not source.is_file():  # its reader would wait, and a converter reads it more than once
         raise ConfigError("is a pipe or a device", where=source, expected="a file or a folder", fix="Write it to a file first")
     if is_pointer(source):
         raise nothing_found(source, packed=False)
     found = _find(source, format, Path(out))
     if found.names() and not source.is_dir():
-        return _convert_found(found, source, out, sequences, ways, workers, progress)
+        return _convert_found(found, source, out, sequences, template, workers, progress)
     unpack = next(module.unpacked for _, module in _converters(AUTO) if hasattr(module, "unpacked"))
     with unpack(source, Path(out), found.places) as packed:
         if packed.root is not None:
             found.add(_find(packed.content, format, Path(out)), packed)
         if not found.names():
             raise nothing_found(packed.content, packed=packed.root is not None)
-        report = _convert_found(found, source, out, sequences, ways, workers, progress)
+        report = _convert_found(found, source, out, sequences, template, workers, progress)
         report.losses.extend(left_out_below(packed.content))
     if packed.root is None:
         return report
@@ -117,7 +117,7 @@ def _convert_found(
     source: Path,
     out: str | Path,
     sequences: Sequence[str],
-    ways: Job,
+    template: Job,
     workers: int | None,
     progress: Progress | None,
 ) -> ConvertReport:
@@ -128,7 +128,7 @@ def _convert_found(
     with removed_if_empty(Path(out).parent), removed_if_empty(Path(out)):
         targets = _targets([job.sequence.name for job in source_sequences.jobs], out, many=len(names) > 1)
         jobs = [
-            replace(ways, converter=job.converter, sequence=job.sequence, target=target)
+            replace(template, converter=job.converter, sequence=job.sequence, target=target)
             for job, target in zip(source_sequences.jobs, targets, strict=True)
         ]
         if len(names) == 1 and source_sequences.errors:
@@ -157,21 +157,21 @@ def _find(source: Path, format: str, out: Path) -> _Sequences:
     errors: dict[str, tuple[str, ImutoolError]] = {}
     for key, module in _converters(format):
         for sequence in module.sequences(source):
-            mine = claims.setdefault(str(sequence), [])
-            if mine and is_general(module):
+            claimed = claims.setdefault(str(sequence), [])
+            if claimed and is_general(module):
                 continue  # a data set's own converter knows more
             try:
                 if format != AUTO or module.recognises(sequence):
-                    mine.append(Job(key, sequence))
-                elif not mine:
+                    claimed.append(Job(key, sequence))
+                elif not claimed:
                     reason = DataError("no converter recognises it", where=str(sequence), fix="Choose one with `format`")
                     errors.setdefault(str(sequence), (sequence.name, reason))
             except ImutoolError as error:
                 errors[str(sequence)] = (sequence.name, error)
     if not claims and source.is_dir():  # logs of its own are sources where nothing else is, as for `fix`
         found = ((key, m.own_logs(source)) for key, m in _converters(format) if hasattr(m, "own_logs"))
-        apart = ((key, log) for key, own in found for log in own if not log.path.resolve().is_relative_to(out.resolve()))
-        claims = {str(log): [Job(key, log)] for key, log in apart}
+        outside = ((key, log) for key, own in found for log in own if not log.path.resolve().is_relative_to(out.resolve()))
+        claims = {str(log): [Job(key, log)] for key, log in outside}
     for place, jobs in claims.items():
         if len(jobs) > 1:
             keys = " and ".join(job.converter for job in jobs)
@@ -259,7 +259,7 @@ def _from_stream(
     source: Path,
     out: str | Path,
     wanted: Sequence[str],
-    ways: Job,
+    template: Job,
     progress: Progress | None,
 ) -> ConvertReport:
     """Convert one after the other, with a converter that only has `read`.
@@ -276,8 +276,8 @@ def _from_stream(
         if target in report.written:
             what, fix = f"two sequences are named {recording.name}", "Its converter has to tell them apart"
             raise ConfigError(what, where=source, fix=fix)
-        check_targets([job := replace(ways, sequence=recording, target=target)], source)
-        kept = replace(recording, frames={}) if isinstance(recording, Recording) and not ways.images else recording
+        check_targets([job := replace(template, sequence=recording, target=target)], source)
+        kept = replace(recording, frames={}) if isinstance(recording, Recording) and not template.images else recording
         report.add(target, write_content(kept, job))
         if progress is not None:
             progress(len(report.written), len(report.written), recording.name)

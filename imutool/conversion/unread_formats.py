@@ -12,8 +12,8 @@ from imutool.errors import DataError, ImutoolError
 from imutool.file_location import compression, first_bytes
 
 ENOUGH = 1024  # bytes of a file's start
-MOST_FILES = 1000  # of a folder, which are looked at
-MOST_NAMED = 3  # pointers
+MAX_FILES = 1000  # of a folder, which are looked at
+MAX_NAMED = 3  # pointers
 RECORDINGS = (  # endings of what may be a recording, or a part of one
     r"\.(bag|db3|mcap|ulg|bin|log|csv|tsv|txt|dat|tum|jsonl?|mat|np[yz]|parquet|feather|arrow|h5|hdf5|xlsx?|zip|tar|gz|xz|bz2|zstd?)$"
 )
@@ -109,11 +109,11 @@ def left_out_below(folder: Path) -> list[str]:
     found, closed = [path.name for path in pointers_in(folder)], _closed_in(folder)
     pointers = f"{_listed(found)}: pointers of Git LFS in place of the files are left out. {GET_FILES}"
     unread = f"{_listed(closed)} may not be read and is left out. {GIVE_RIGHT}"
-    return [said for said, names in ((pointers, found), (unread, closed)) if names]
+    return [reason for reason, names in ((pointers, found), (unread, closed)) if names]
 
 
 def _listed(names: list[str]) -> str:
-    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
+    return ", ".join(names[:MAX_NAMED]) + (f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else "")
 
 
 def _closed_in(folder: Path) -> list[str]:
@@ -137,7 +137,7 @@ def pointers_in(folder: Path) -> list[Path]:
     """Pointers of Git LFS among the first recordings in a folder."""
     paths = (Path(inside, name) for inside, _, files in os.walk(folder) for name in sorted(files))
     recorded = (path for path in paths if re.search(RECORDINGS, path.name.lower()))
-    return [path for path in islice(recorded, MOST_FILES) if is_pointer(path)]
+    return [path for path in islice(recorded, MAX_FILES) if is_pointer(path)]
 
 
 def describe_unread(start: bytes) -> tuple[str, str]:
@@ -150,7 +150,7 @@ def describe_unread(start: bytes) -> tuple[str, str]:
 
 
 def _known(start: bytes) -> tuple[str, str] | None:
-    return next((said for pattern, said in FORMATS.items() if re.match(pattern, start, re.DOTALL)), None)
+    return next((description for pattern, description in FORMATS.items() if re.match(pattern, start, re.DOTALL)), None)
 
 
 def describe_folder(folder: Path) -> tuple[str, str]:
@@ -159,13 +159,13 @@ def describe_folder(folder: Path) -> tuple[str, str]:
     names = {path.name.lower() for path in paths}
     if names & ST_DATALOG and any(name.endswith(".dat") for name in names):
         return "it is an acquisition of ST's High Speed Datalog", "Export it as CSV with ST's stdatalog, and convert that"
-    said: dict[tuple[str, str], list[str]] = {}
-    for path in paths[:MOST_FILES]:
+    descriptions: dict[tuple[str, str], list[str]] = {}
+    for path in paths[:MAX_FILES]:
         is_table = path.suffix.lower() in ZIPPED_TABLES  # that shows no IMU, and is no archive of recordings
         if path.is_file() and not is_table and (found := _known(first_bytes(path, ENOUGH))):
-            said.setdefault(found, []).append(path.name)
-    if said:
-        (what, fix), alike = max(said.items(), key=lambda each: len(each[1]))
+            descriptions.setdefault(found, []).append(path.name)
+    if descriptions:
+        (what, fix), alike = max(descriptions.items(), key=lambda each: len(each[1]))
         others = f" and {len(alike) - 1} other{'s' * (len(alike) > 2)}" if len(alike) > 1 else ""
         return f"of {alike[0]}{others}, {what}", fix
     if closed := _closed_in(folder):

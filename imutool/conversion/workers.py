@@ -54,7 +54,7 @@ class Job:
     mapping: Path | Mapping[str, Any] | None = None  # what the columns of a table mean
     correct: tuple[str, ...] = ()  # `conventions`, `stamps`
     common: Corrections | None = None  # of the other logs of its setup
-    said: str = ""  # note on the job itself
+    note: str = ""  # on the job itself
 
 
 @dataclass(frozen=True)
@@ -98,11 +98,11 @@ def run_jobs(jobs: Sequence[Job], of: int, workers: int, progress: Progress | No
     """
     jobs, outcomes = [*jobs], dict(_run(jobs, of, workers, progress))
     for with_common in (_with_common_map, _with_common_order, _with_common_corrections):
-        again = with_common(jobs, outcomes)
-        numbers = [*again]
-        for place, outcome in _run([*again.values()], len(again), workers, progress):
+        repeated = with_common(jobs, outcomes)
+        numbers = [*repeated]
+        for place, outcome in _run([*repeated.values()], len(repeated), workers, progress):
             if outcome.error is None:
-                jobs[numbers[place]], outcomes[numbers[place]] = again[numbers[place]], outcome
+                jobs[numbers[place]], outcomes[numbers[place]] = repeated[numbers[place]], outcome
     return outcomes
 
 
@@ -112,7 +112,7 @@ def _with_common_map(jobs: Sequence[Job], outcomes: Mapping[int, Outcome]) -> di
     if common is None:
         return {}
     asking = [n for n, outcome in outcomes.items() if isinstance(outcome.error, ConfigError) and jobs[n].mapping is None]
-    return {n: replace(jobs[n], mapping=common, said=SAME_COLUMNS) for n in asking}
+    return {n: replace(jobs[n], mapping=common, note=SAME_COLUMNS) for n in asking}
 
 
 def _with_common_order(jobs: Sequence[Job], outcomes: Mapping[int, Outcome]) -> dict[int, Job]:
@@ -129,7 +129,7 @@ def _with_common_order(jobs: Sequence[Job], outcomes: Mapping[int, Outcome]) -> 
         if order != common
     }
     maps = {number: {**outcomes[number].mapping, ORDER: order} for number, order in others.items()}
-    return {n: replace(jobs[n], mapping=mapping, said=SAME_ORDER, overwrite=True) for n, mapping in maps.items()}
+    return {n: replace(jobs[n], mapping=mapping, note=SAME_ORDER, overwrite=True) for n, mapping in maps.items()}
 
 
 def _with_common_corrections(jobs: Sequence[Job], outcomes: Mapping[int, Outcome]) -> dict[int, Job]:
@@ -182,11 +182,11 @@ def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
         with holder as folder:
             recorded = Path(folder) / job.target.name
             outcome = write_content(content, replace(job, target=recorded, correct=()))
-            ways = job.correct, job.common
-            notes, found = write_corrected(recorded, job.target, *ways, compression=job.compression, overwrite=job.overwrite)
+            fixes = job.correct, job.common
+            notes, found = write_corrected(recorded, job.target, *fixes, compression=job.compression, overwrite=job.overwrite)
             return replace(outcome, notes=(*outcome.notes, *notes), corrections=found)
     labelled = job.labels.put_on(content)
-    if job.said and isinstance(labelled, MessageLog) and labelled.remarks.doubts:  # what others show does not hold here
+    if job.note and isinstance(labelled, MessageLog) and labelled.remarks.doubts:  # what others show does not hold here
         raise ConfigError(labelled.remarks.doubts[0], where=str(job.sequence))
     if isinstance(labelled, Recording):
         write(labelled, job.target, compression=job.compression, overwrite=job.overwrite)
@@ -197,7 +197,7 @@ def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
         lacking = () if log.imu_topics else (f"no topic is an IMU{joined}",)
         own = {name: topic.reflected for name, topic in log.topics.items() if isinstance(topic.reflected, Reflected)}
     stated = [f"{name}: {found.units}, by the comments of its definition" for name, found in own.items() if found.units]
-    notes = *filter(None, [job.said]), *labelled.remarks.notes, *stated, *lacking
+    notes = *filter(None, [job.note]), *labelled.remarks.notes, *stated, *lacking
     return Outcome(None, notes, tuple(labelled.remarks.losses), mapping=labelled.metadata.get(MAP, {}))
 
 

@@ -40,7 +40,7 @@ METRIC_S = 600.0  # that a metric may take
 
 def closed_loop(
     first: Diagnosis,
-    again: Diagnosis,
+    second: Diagnosis,
     log: Path,
     *,
     metric: tuple[float, float] | None = None,
@@ -50,20 +50,20 @@ def closed_loop(
 
     `metric` is the user's figure of both (`figure`).
     """
-    other = ANOTHER_MOTION in again.remarks and ANOTHER_MOTION not in first.remarks  # then its figures are of other poses
-    compared = [] if other else [*_compared(_shared(first, again))]
+    other = ANOTHER_MOTION in second.remarks and ANOTHER_MOTION not in first.remarks  # then its figures are of other poses
+    compared = [] if other else [*_compared(_shared(first, second))]
     if metric is not None:
         compared.append(Compared("metric", *metric, "-"))
     given = {finding.effect for finding in first.findings} & STAYS
-    missing = tuple(finding.effect for finding in again.findings if finding.effect not in given)
-    white = all(again.unexplained[sensor].white for sensor in SENSORS if sensor in again.unexplained)  # what was simulated
-    nameless = not white or (bool(again.located) and not again.findings)  # the misfit of what stays is located, too
+    missing = tuple(finding.effect for finding in second.findings if finding.effect not in given)
+    white = all(second.unexplained[sensor].white for sensor in SENSORS if sensor in second.unexplained)  # what was simulated
+    nameless = not white or (bool(second.located) and not second.findings)  # the misfit of what stays is located, too
     return ClosedLoop(str(log), bool(missing) or nameless or other, missing, tuple(compared), rounds)
 
 
-def is_worth_a_round(first: Diagnosis, again: Diagnosis) -> bool:
+def is_worth_a_round(first: Diagnosis, second: Diagnosis) -> bool:
     """Whether a search that begins with all effects of both may find more than the first did."""
-    named = {finding.effect for finding in again.findings if finding.kind == "catalogue"} - NO_EFFECT
+    named = {finding.effect for finding in second.findings if finding.kind == "catalogue"} - NO_EFFECT
     return bool(named - {finding.effect for finding in first.findings})
 
 
@@ -127,7 +127,7 @@ def figure(metric: Callable[[Path], float], log: Path) -> float:
 def table(loop: ClosedLoop) -> list[list[str]]:
     """Rows of the comparison, with its header."""
     rows = [["Figure", "Before", "After", "Unit"]]
-    return rows + [[one.figure, f"{one.before:.3g}", f"{one.after:.3g}", symbol(one.unit) or "–"] for one in loop.compared]
+    return rows + [[row.figure, f"{row.before:.3g}", f"{row.after:.3g}", symbol(row.unit) or "–"] for row in loop.compared]
 
 
 class _Stretch(NamedTuple):
@@ -139,12 +139,12 @@ class _Stretch(NamedTuple):
 
     def misfits(self, part: slice) -> list[Float64[np.ndarray, "n 3"]]:
         """Of a sensor, before and after."""
-        return [(self.real - one)[:, part] for one in self.expected]
+        return [(self.real - expected)[:, part] for expected in self.expected]
 
 
-def _shared(first: Diagnosis, again: Diagnosis) -> list[_Stretch]:
+def _shared(first: Diagnosis, second: Diagnosis) -> list[_Stretch]:
     out = []
-    for before, after in product(first.traces, again.traces):
+    for before, after in product(first.traces, second.traces):
         t_s, rows, later = np.intersect1d(before.t_s, after.t_s, return_indices=True)
         if len(t_s) > 1:
             out.append(_Stretch(t_s, before.real[rows], (before.before[rows], after.before[later])))
@@ -155,15 +155,15 @@ def _compared(stretches: Sequence[_Stretch]) -> Iterator[Compared]:
     """Figures of the expected samples over all stretches."""
     for k, sensor in enumerate(SENSORS):
         part, unit = slice(3 * k, 3 * k + 3), ASCII_UNITS[sensor]
-        misfits = [np.concatenate(all_of) for all_of in zip(*(one.misfits(part) for one in stretches), strict=True)]
+        misfits = [np.concatenate(all_of) for all_of in zip(*(stretch.misfits(part) for stretch in stretches), strict=True)]
         yield Compared(f"{sensor} rms", _rms(misfits[0]), _rms(misfits[1]), unit)
-        bands = [_by_band([(one.t_s, one.misfits(part)[k]) for one in stretches]) for k in range(2)]
+        bands = [_by_band([(stretch.t_s, stretch.misfits(part)[k]) for stretch in stretches]) for k in range(2)]
         for name in bands[0]:
             yield Compared(f"{sensor} rms, {name}", bands[0][name], bands[1][name], unit)
         parts = [np.array_split(misfit, LATE_PARTS) for misfit in misfits]
         for quarter, (a, b) in enumerate(zip(*parts, strict=True), start=1):
             yield Compared(f"{sensor} rms, quarter {quarter}", _rms(a), _rms(b), unit)
-    before, after = (_integrated([(one.t_s, one.real, one.expected[k]) for one in stretches]) for k in range(2))
+    before, after = (_integrated([(stretch.t_s, stretch.real, stretch.expected[k]) for stretch in stretches]) for k in range(2))
     for name, was, is_now, unit in zip(("rotation", "path"), before, after, ("rad", "m"), strict=True):
         yield Compared(f"{name} over {WINDOW_S:g} s", was, is_now, unit)
 
@@ -188,12 +188,12 @@ def _by_band(misfits: Sequence[tuple[Float64[np.ndarray, " _"], Float64[np.ndarr
 
 def _integrated(stretches: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[float, float]:
     """Rotation (rad) and displacement (m) by which recorded and expected samples part within windows; root mean squares."""
-    angle, apart = [], []
+    angle, distance = [], []
     for t_s, real, simulated in stretches:
         (R_real, p_real), (R_sim, p_sim) = (_window_ends(samples, t_s) for samples in (real, simulated))
         angle.append((R_real.inv() * R_sim).magnitude())
-        apart.append(((p_real - p_sim) ** 2).sum(axis=1))
-    return float(np.sqrt(np.mean(np.concatenate(angle) ** 2))), float(np.sqrt(np.concatenate(apart).mean()))
+        distance.append(((p_real - p_sim) ** 2).sum(axis=1))
+    return float(np.sqrt(np.mean(np.concatenate(angle) ** 2))), float(np.sqrt(np.concatenate(distance).mean()))
 
 
 def _window_ends(

@@ -92,7 +92,7 @@ def contradictions(logs: Sequence[WhitenedLog], selection: Selection) -> Iterato
     beside = [
         effect
         for effect in catalogue.diagnosed((*OF_UNIT, *OF_LOG))
-        if not any(exclude_each_other(effect, one) for one, _ in found.chosen)
+        if not any(exclude_each_other(effect, rival) for rival, _ in found.chosen)
     ]
     chosen = (*found.chosen, *((effect, effect.null_value.astype(float)) for effect in beside))
     whole = fit(logs, chosen, found.part)
@@ -109,7 +109,7 @@ def _odd_one(missed: Mapping[Fit, float], logs: Sequence[WhitenedLog], chosen: C
     entries = [(own, fit([log for log in logs if log not in own.logs], chosen, own.part)) for own in missed]
     if len(entries) == 2:
         return max(entries, key=lambda entry: missed[entry[0]])
-    return min(entries, key=lambda entry: max(_missed(one, entry[1], always) for one in missed if one is not entry[0]))
+    return min(entries, key=lambda entry: max(_missed(e, entry[1], always) for e in missed if e is not entry[0]))
 
 
 def _by_log(whole: Fit) -> Iterator[Fit]:
@@ -124,9 +124,9 @@ def _by_log(whole: Fit) -> Iterator[Fit]:
 
 def _missed(own: Fit, whole: Fit, always: int) -> float:
     """Squares that an axis of a recording loses by the numbers of all, over those that its own leave, or explain there."""
-    without, left = fit(own.logs, own.chosen[:always], own.part), _squares(own, own.logs)
+    without, rest = fit(own.logs, own.chosen[:always], own.part), _squares(own, own.logs)
     return float(
-        ((_squares(whole, own.logs) - left) / np.maximum(np.maximum(left, _squares(without, own.logs) - left), 1.0)).max()
+        ((_squares(whole, own.logs) - rest) / np.maximum(np.maximum(rest, _squares(without, own.logs) - rest), 1.0)).max()
     )
 
 
@@ -142,16 +142,16 @@ def _squares(found: Fit, logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, " k
 def _differing(own: Fit, others: Fit, found: Fit) -> str:
     """The effect whose own numbers explain most beside those of the others, and both numbers, fitted beside the findings."""
     theta, pull = dict(zip(others.keys, others.chosen, strict=True)), np.zeros(len(own.information))
-    for effect, mine in own.chosen:
-        theirs = values_of(theta[effect.key][0], effect, theta[effect.key][1])
-        off = np.nan_to_num(free(effect, mine) - free(effect, theirs))
+    for effect, own_theta in own.chosen:
+        other_values = values_of(theta[effect.key][0], effect, theta[effect.key][1])
+        off = np.nan_to_num(free(effect, own_theta) - free(effect, other_values))
         pull += own.information[:, own.place(effect.key)] @ off
     parts = {key: own.place(key) for key in own.keys}
     gain = {key: float(pull[at] @ np.linalg.pinv(own.information[at, at]) @ pull[at]) for key, at in parts.items()}
     key = max(gain, key=lambda name: gain[name])
     own, others = (
-        fit(one.logs, tuple(entry for entry in one.chosen if entry[0].key in (key, *found.keys)), one.part)
-        for one in (own, others)
+        fit(side.logs, tuple(entry for entry in side.chosen if entry[0].key in (key, *found.keys)), side.part)
+        for side in (own, others)
     )
     return f"its {key.replace('_', ' ')} is {_numbers_of(own, key)}, theirs {_numbers_of(others, key)}"
 
@@ -181,7 +181,7 @@ def _key(finding: Finding) -> tuple[str, ...]:
 def _alike(real: Finding, sim: Finding) -> bool:
     if real.curve is not None and sim.curve is not None:
         return _same_curve(real.curve, sim.curve)
-    return _same_numbers(*(_inverted(one.effect, _without_phase(one.parameters)) for one in (real, sim)))
+    return _same_numbers(*(_inverted(f.effect, _without_phase(f.parameters)) for f in (real, sim)))
 
 
 def _inverted(name: str, parameters: Mapping[str, Estimate]) -> dict[str, Estimate]:
@@ -189,14 +189,14 @@ def _inverted(name: str, parameters: Mapping[str, Estimate]) -> dict[str, Estima
     of_effect = (each for effect in catalogue.diagnosed() if effect.name == name for each in effect.parameters)
     endless = {each.name for each in of_effect if np.isinf(each.null_value) and not each.begins}
     return {
-        key: Estimate(1.0 / one.value, one.std / one.value**2, f"1/({one.unit})") if key in endless else one
-        for key, one in parameters.items()
+        key: Estimate(1.0 / e.value, e.std / e.value**2, f"1/({e.unit})") if key in endless else e
+        for key, e in parameters.items()
     }
 
 
 def _without_phase(parameters: Mapping[str, Estimate]) -> dict[str, Estimate]:
     """Parameters with amplitudes for sines and cosines: two logs of one vibration begin at other phases."""
-    out = {name: one for name, one in parameters.items() if "_sin_" not in name and "_cos_" not in name}
+    out = {name: e for name, e in parameters.items() if "_sin_" not in name and "_cos_" not in name}
     for name, s in parameters.items():
         if "_sin_" in name:
             c = parameters[name.replace("_sin_", "_cos_")]

@@ -102,8 +102,8 @@ def diagnose(
     if others and sim is None and not recordings[0].truths:
         diagnosis = check_without_reference(recordings[0], str(reals[0]), "no simulation and no true poses", settings)
     else:
-        told = [*(log.remark for log in logs_read if log.remark), *(wrong if sim is None else ())]
-        diagnosis, _ = _beside_reference(recordings, reals, sim, imu, truth, signals, told, report, settings, begin)
+        remarks_read = [*(log.remark for log in logs_read if log.remark), *(wrong if sim is None else ())]
+        diagnosis, _ = _beside_reference(recordings, reals, sim, imu, truth, signals, remarks_read, report, settings, begin)
     if others and first is not None:
         diagnosis = _with_other_imus(diagnosis, recordings[0], reals[0], first, others, settings)
     report(4, 4, "")
@@ -117,12 +117,12 @@ def _beside_reference(
     imu: str | None,
     truth: str | None,
     signals: Sequence[str],
-    told: Sequence[str],
+    remarks_read: Sequence[str],
     report: Tell,
     settings: DiagnoseSettings,
     begin: Sequence[Finding],
 ) -> tuple[Diagnosis, Selection | None]:
-    """Diagnosis of recordings beside a simulation or their own poses, with remarks that were `told` as they were read.
+    """Diagnosis of recordings against a simulation or their own poses, with remarks that were `remarks_read` as they were read.
 
     The selection of effects comes with it; none without a reference.
     """
@@ -162,7 +162,7 @@ def _beside_reference(
     diagnosis = replace(diagnosis, findings=summarize.with_similar(diagnosis.findings, selection, similar.result()))
     caveat = reference_caveat(recordings) if (poses := any(not pair.exact for pair in pairs)) else ""
     follows = [own_poses_sentence(pairs)] if poses and simulated is not None else []
-    remarks = (*another, *left_out, *follows, *diagnosis.remarks, *dict.fromkeys(told))
+    remarks = (*another, *left_out, *follows, *diagnosis.remarks, *dict.fromkeys(remarks_read))
     findings, located = (*conventions, *wrong, *diagnosis.findings), places if wrong else diagnosis.located or places
     diagnosis = replace(diagnosis, findings=findings, located=located, remarks=remarks, caveat=caveat)
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
@@ -173,7 +173,7 @@ def _beside_reference(
 def _by_itself(
     sim: Location, imu: str | None, truth: str, settings: DiagnoseSettings
 ) -> tuple[tuple[Finding, ...], Selection | None]:
-    """Findings and selected effects of a simulation beside its own poses."""
+    """Findings and selected effects of a simulation against its own poses."""
     alone = [with_channels(read_log(sim, imu=imu, truth=truth), sim).recording]
     diagnosis, selection = _beside_reference(alone, [sim], None, imu, truth, (), (), lambda *_: None, settings, ())
     return diagnosis.findings, selection

@@ -27,11 +27,11 @@ from imutool.sensor.samples import IdealMotion
 from imutool.sensor.simulate import MOTION_HZ
 from imutool.sensor.trajectory import smooth_motion
 
-LEAST_NOISE = {"gyro": 1e-4, "accel": 1e-3}  # rad/s, m/s²: of a sensor without a usable axis
+MIN_NOISE = {"gyro": 1e-4, "accel": 1e-3}  # rad/s, m/s²: of a sensor without a usable axis
 AS_GOOD = 0.3  # of the noise: how far a simulation along the poses may be from the one that was given, and still stand for it
 MODES = 6  # order of the subspace model: the mode, and two that take up what is left
 RINGING_BAND = 1.5  # times the frequency of a mount, on both sides
-MOST_OF_IT = 0.8  # of the held-out samples that the poses have to cover
+MAX_OF_IT = 0.8  # of the held-out samples that the poses have to cover
 
 
 def with_effects(pair: AlignedLog, chosen: Chosen) -> Float64[np.ndarray, "n k"]:
@@ -53,7 +53,7 @@ def noise_floor(logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, " k"]:
     variance = total / np.maximum(count, 1.0)
     for signal, part in logs[0].pair.signals.items():
         known = count[part] > 0
-        variance[part][~known] = variance[part][known].mean() if known.any() else LEAST_NOISE[signal] ** 2
+        variance[part][~known] = variance[part][known].mean() if known.any() else MIN_NOISE[signal] ** 2
     return np.asarray(np.sqrt(variance))
 
 
@@ -99,24 +99,24 @@ def unexplained_residuals(
     noises: Float64[np.ndarray, " k"],
     settings: HeldOutSettings,
 ) -> dict[str, Unexplained]:
-    """Residuals by signal with their noise; beside poses, blocks decide on whiteness."""
+    """Residuals by signal with their noise; against poses, blocks decide on whiteness."""
     out, beside_poses, signals = {}, any(log.whiten.band is not None for log in logs), logs[0].pair.signals
     for signal in known_signals(logs):
         held_out, noise = held_out_rms(logs, after, after, signal), signal_noise(logs, noises, signal)
         part = signals[signal]
         held_out_count = sum(len(_residual(log, model, part)) for log, model in zip(logs, after, strict=True))
         fitted_count = sum(log.count("fitted") for log in logs) / len(signals)
-        most, p_value = settings.white_ratio, 1.0
+        maximum, p_value = settings.white_ratio, 1.0
         if held_out_count:
             by_chance = fisher(held_out_count, max(fitted_count, 1.0))
-            most = max(most, float(np.sqrt(by_chance.isf(settings.few_samples_p_value))))
+            maximum = max(maximum, float(np.sqrt(by_chance.isf(settings.few_samples_p_value))))
             p_value = float(by_chance.sf((held_out.rms_after / noise) ** 2))
-        white = held_out.rms_after < most * noise
+        white = held_out.rms_after < maximum * noise
         if not white and beside_poses:
             p_value = _p_value(logs, after, part, noise, settings)
-            white = p_value > settings.white_p_value and held_out.rms_after < settings.most_white_ratio * noise
-        least = held_out.rms_after or noise  # no noise is larger: it was measured beside what the findings explain
-        out[signal] = Unexplained(held_out.rms_after, min(noise, least), white, p_value)
+            white = p_value > settings.white_p_value and held_out.rms_after < settings.max_white_ratio * noise
+        minimum = held_out.rms_after or noise  # no noise is larger: it was measured beside what the findings explain
+        out[signal] = Unexplained(held_out.rms_after, min(noise, minimum), white, p_value)
     return out
 
 
@@ -165,9 +165,9 @@ def ringing(logs: Sequence[WhitenedImu], after: Sequence[np.ndarray], settings: 
     residual = residual - residual.mean(axis=0)
     f_hz, power = welch(residual, rate_hz, nperseg=min(settings.segment_samples, len(residual)), axis=0)
     total = power.sum(axis=1)
-    left, top = log.pair.noise_left, log.pair.settings.alignment.noise_band
-    most_hz = top * min(0.5 * rate_hz, np.inf if left is None else left.f_hz[-1])  # above, a simulation has no motion
-    seen = (f_hz >= settings.least_hz) & (f_hz <= most_hz)
+    noise, top = log.pair.noise_left, log.pair.settings.alignment.noise_band
+    max_hz = top * min(0.5 * rate_hz, np.inf if noise is None else noise.f_hz[-1])  # above, a simulation has no motion
+    seen = (f_hz >= settings.min_hz) & (f_hz <= max_hz)
     if not seen.any():
         return []
     peak = int(np.flatnonzero(seen)[np.argmax(total[seen])])
@@ -182,13 +182,13 @@ def ringing(logs: Sequence[WhitenedImu], after: Sequence[np.ndarray], settings: 
     (f0, zeta), others = poles[0], poles[1:]
     std = np.sqrt((len(others) - 1) * ((others - others.mean(axis=0)) ** 2).mean(axis=0))
     clear = np.isfinite(poles).all() and std[0] < 0.05 * f0 and 3.0 * std[1] < zeta
-    if not clear or not settings.least_damping < zeta < settings.most_damping:
+    if not clear or not settings.min_damping < zeta < settings.max_damping:
         return []
     edges_hz = f0 / RINGING_BAND, min(f0 * RINGING_BAND, 0.49 * rate_hz)
     alone = sosfiltfilt(butter(2, edges_hz, "bandpass", fs=rate_hz, output="sos"), residual, axis=0)[rows]
-    least = log.pair.settings.search.model_error_reference * float(after[0][rows, 3:].var(axis=0).sum())  # a simulation rounds
-    wanders = (alone**4).mean() < settings.least_kurtosis * (alone**2).mean() ** 2  # as a rotor's speed: nothing decays
-    if wanders or (alone**2).sum(axis=1).mean() < least:
+    lower = log.pair.settings.search.model_error_reference * float(after[0][rows, 3:].var(axis=0).sum())  # a simulation rounds
+    wanders = (alone**4).mean() < settings.min_kurtosis * (alone**2).mean() ** 2  # as a rotor's speed: nothing decays
+    if wanders or (alone**2).sum(axis=1).mean() < lower:
         return []
     ratio = float(total[peak]) / floor
     p_value = float(chi2.sf(2.0 * ratio * settings.blocks, 2 * settings.blocks))
@@ -206,10 +206,10 @@ def _correlation(x: Float64[np.ndarray, "n k"], lags: int) -> Float64[np.ndarray
 def _pole(c: Float64[np.ndarray, " l"], rate_hz: float, near_hz: float) -> tuple[float, float]:
     """Frequency (Hz) and damping of the mode nearest to a frequency; NaN where there is none."""
     n = len(c) // 2
-    now, later = (hankel(c[k : k + n], c[k + n - 1 : k + 2 * n - 1]) for k in (0, 1))
-    U, s, Vt = np.linalg.svd(now)
+    before, after = (hankel(c[k : k + n], c[k + n - 1 : k + 2 * n - 1]) for k in (0, 1))
+    U, s, Vt = np.linalg.svd(before)
     root = np.sqrt(s[:MODES])
-    A = (U[:, :MODES] / root).T @ later @ (Vt[:MODES].T / root)
+    A = (U[:, :MODES] / root).T @ after @ (Vt[:MODES].T / root)
     z = np.log(np.linalg.eigvals(A).astype(complex)) * rate_hz
     z = z[(z.imag > 0.0) & (z.real < 0.0)]
     if not len(z):
@@ -238,20 +238,20 @@ def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile
     acting = physics.acting()
     covered, before, after = [], [], []
     for log in logs:
-        on_its_clock = [_on_clock_of(one, motion.start_ns, log.pair) for one in ideals]
+        on_its_clock = [_on_clock_of(gain, motion.start_ns, log.pair) for gain in ideals]
         plain, simulated = (_read(log.pair, on_its_clock, [*effects, *clock]) for effects in ((), acting))
         finite = np.isfinite(plain).all(axis=1) & np.isfinite(simulated).all(axis=1)
         given = expected(log.pair, clock)
         plain, simulated = (np.where(finite[:, None], read, given) for read in (plain, simulated))  # a filter spreads NaN
         pair = replace(log.pair, fitted=log.pair.fitted & finite, held_out=log.pair.held_out & finite)
-        if pair.held_out.sum() < MOST_OF_IT * log.pair.held_out.sum():
+        if pair.held_out.sum() < MAX_OF_IT * log.pair.held_out.sum():
             raise DataError("its poses cover too little of the recording", where=sim.name)
         covered.append(WhitenedImu(pair, log.whiten))
         before.append(with_constant(pair, given))
         after.append(with_constant(pair, given + simulated - plain))  # what a curve through poses misses is no physics
         _refuse_unlike(covered[-1], before[-1], with_constant(pair, plain), sim)
     return {
-        signal: msgspec.structs.replace(one, by="second simulation") for signal, one in gains(covered, before, after).items()
+        signal: msgspec.structs.replace(gain, by="second simulation") for signal, gain in gains(covered, before, after).items()
     }
 
 
@@ -264,7 +264,7 @@ def _on_clock_of(ideal: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:
 
 def _read(pair: Pair, ideals: Sequence[IdealMotion], acting: Acting) -> Float64[np.ndarray, "n 6"]:
     """What the second simulation reads at the recording's stamps; NaN where it has no motion."""
-    stamps = [pair.stamp_s[(pair.stamp_s >= one.t_s[0]) & (pair.stamp_s <= one.t_s[-1])] for one in ideals]
+    stamps = [pair.stamp_s[(pair.stamp_s >= ideal.t_s[0]) & (pair.stamp_s <= ideal.t_s[-1])] for ideal in ideals]
     samples = simulate_stretches(ideals, stamps, acting)
     out = np.full(pair.real.shape, np.nan)
     out[np.searchsorted(pair.stamp_s, samples.stamp_s)] = np.concatenate([samples.gyro, samples.accel], axis=1)

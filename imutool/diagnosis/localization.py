@@ -56,9 +56,9 @@ def locate_residual(
     `p_values` are those of white noise, by signal. Beside an exact simulation the samples count where they hold far more than
     the means, which lose a vibration. Poses show no such motion.
     """
-    left = [pair.real - a for pair, a in zip(pairs, after, strict=True)]
+    residuals = [pair.real - a for pair, a in zip(pairs, after, strict=True)]
     counts = (settings.mean_samples, 1) if all(pair.exact for pair in pairs) else (settings.mean_samples,)
-    located = _locate_logs(pairs, left, floor, p_values, settings, p_values, averaged=counts)
+    located = _locate_logs(pairs, residuals, floor, p_values, settings, p_values, averaged=counts)
     return [place for place in located if place.signal in p_values]
 
 
@@ -145,8 +145,8 @@ def locate(
         if averaged:
             by_axis, inside = _beyond_noise(scaled[:, columns], window, averaged, settings)
         axes_power, power = by_axis.sum(axis=0), by_axis.sum(axis=1)
-        least = max(settings.clear_squares, settings.axis_share * axes_power.max())
-        axes = np.flatnonzero(axes_power > least).tolist()
+        minimum = max(settings.clear_squares, settings.axis_share * axes_power.max())
+        axes = np.flatnonzero(axes_power > minimum).tolist()
         if axes and not inside.any() and signal in certain:
             inside = np.ones(len(power), bool)
         if not axes or not inside.any():
@@ -175,8 +175,8 @@ def _without_bias(scaled: Samples) -> Samples:
     out = scaled - np.median(scaled, axis=0)
     for k in range(out.shape[1]):
         _, first, counts = np.unique(np.rint(out[:, k] / ALIKE), return_index=True, return_counts=True)
-        most = int(counts.argmax())
-        out[:, k] -= out[first[most], k] if counts[most] > NONE * len(out) else 0.0
+        maximum = int(counts.argmax())
+        out[:, k] -= out[first[maximum], k] if counts[maximum] > NONE * len(out) else 0.0
     return np.where(np.abs(out) < 2.0 * ALIKE, 0.0, out)
 
 
@@ -254,13 +254,13 @@ def regime(
         for sign, word in ((1.0, "above"), (-1.0, "below")):
             index, threshold = _youden(sign * level, high)
             p = float(mannwhitneyu(sign * level[high], sign * level[~high], alternative="greater").pvalue) * 2 * len(variables)
-            if p < settings.p_value and index > settings.least_youden and (best is None or index > best[0]):
+            if p < settings.p_value and index > settings.min_youden and (best is None or index > best[0]):
                 best = index, _words(name, word, sign * threshold, unit)
     if best is None:
         return ("everywhere", "always") if inside.all() else ("intermittent", "no regime: it comes and goes")
     text = best[1]
-    most = "most" if text.startswith(TIMES) else "most with"
-    return ("everywhere", f"always, {most} {text}") if inside.all() else ("regime", text)
+    maximum = "most" if text.startswith(TIMES) else "most with"
+    return ("everywhere", f"always, {maximum} {text}") if inside.all() else ("regime", text)
 
 
 def _words(name: str, word: str, threshold: float, unit: str) -> str:

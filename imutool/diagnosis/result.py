@@ -15,7 +15,7 @@ from imutool.report import UNSET, Report, Section, UnsetType
 from imutool.units import ASCII_UNITS
 
 SCHEMA = "imutool.diagnosis/1"
-LEAST_MISFIT = 0.1  # of the noise's power: with less misfit than that, a share of it means nothing
+MIN_MISFIT = 0.1  # of the noise's power: with less misfit than that, a share of it means nothing
 CONVENTIONS = frozenset({"wrong_unit", "permuted_axes", "left_handed"})  # effects that are no physics
 
 Kind = Literal["catalogue", "driven", "unknown"]
@@ -76,7 +76,7 @@ class Closer(HeldOut, frozen=True):
         """Share of the misfit above a noise of this root mean square that was removed."""
         misfit = held_out.rms_before**2 - noise_floor**2
         share = None
-        if misfit > LEAST_MISFIT * noise_floor**2:
+        if misfit > MIN_MISFIT * noise_floor**2:
             share = max(-1.0, min(1.0, (held_out.rms_before**2 - held_out.rms_after**2) / misfit))
         return cls(held_out.rms_before, held_out.rms_after, held_out.unit, held_out.seconds, share)
 
@@ -253,7 +253,7 @@ class Diagnosis:
     start_ns: int | None = None  # of the first log, on the clock of the simulation: times count from it
 
     def __repr__(self) -> str:
-        found = ", ".join(f"{one.effect} ({one.signal}, {one.share:.0%})" for one in self.findings)
+        found = ", ".join(f"{f.effect} ({f.signal}, {f.share:.0%})" for f in self.findings)
         return f"<diagnosis of {', '.join(self.real)}: {found or ('no name' if self.located else 'a constant bias at most')}>"
 
     @classmethod

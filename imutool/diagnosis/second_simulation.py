@@ -18,7 +18,7 @@ from imutool.array_types import Bool, Float64
 from imutool.diagnosis.audit.simulation import imu_in, read_simulation
 from imutool.diagnosis.diagnose import read_log
 from imutool.diagnosis.estimation.aligned_log import DEFAULT
-from imutool.diagnosis.estimation.time_alignment import LEAST_NOISE, same_motion, with_simulation
+from imutool.diagnosis.estimation.time_alignment import MIN_NOISE, same_motion, with_simulation
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.errors import ImutoolError
 from imutool.file_location import Location
@@ -31,7 +31,7 @@ from imutool.sensor import physics_file
 from imutool.sensor.channels import needs_channels, with_channels
 from imutool.sensor.effect import Acting
 from imutool.sensor.physics_file_terms import additive_noise
-from imutool.sensor.simulate import LEAST_S, Simulation, even_stamps, of_noise, simulate, simulated, taken
+from imutool.sensor.simulate import MIN_S, Simulation, even_stamps, of_noise, simulate, simulated, taken
 
 OF_NOISE = 1.5  # times a simulation's own noise, by which an ideal sensor along its poses may differ from its samples
 
@@ -82,7 +82,7 @@ def along_samples(
     alone = beside is None or not same_motion(beside.imu, found.imu, settings.alignment)
     if beside is None or alone:
         beside = with_channels(found, sim).recording if needs_channels(acting) else found
-    short = msgspec.structs.replace(settings, alignment=msgspec.structs.replace(settings.alignment, least_s=LEAST_S))
+    short = msgspec.structs.replace(settings, alignment=msgspec.structs.replace(settings.alignment, min_s=MIN_S))
     pairs = with_simulation(beside, found, short, own_poses=alone)
     ideals, clock_ns = [pair.ideal for pair in pairs], int(beside.imu.t_ns[0])
     sim_ns = clock_ns + nanoseconds(pairs[0].aligned_s)
@@ -111,7 +111,7 @@ def _is_ideal(sim: Recording) -> bool:
         return False
     samples, (inside, ideal) = _columns(sim.imu), _at(along, sim.imu)
     off = samples[inside] - ideal
-    return bool((off.std(axis=0) < OF_NOISE * np.maximum(white_noise(samples), LEAST_NOISE)).all())
+    return bool((off.std(axis=0) < OF_NOISE * np.maximum(white_noise(samples), MIN_NOISE)).all())
 
 
 def _at(imu: Imu, stamps: Imu) -> tuple[Bool[np.ndarray, " n"], Float64[np.ndarray, "m 6"]]:

@@ -63,20 +63,20 @@ def summarize(
     pairs, noise = [log.pair for log in logs], noise_floor(logs)
     exact = all(pair.exact for pair in pairs)
     sample = noise if exact else np.asarray(np.median([white_noise(pair.real) for pair in pairs], axis=0))
-    digits = timestamps.rounded(pairs, sample)  # are a sample's, and a row beside poses is the mean of many
+    digits = timestamps.rounded(pairs, sample)  # are a sample's, and a row against poses is the mean of many
     selection, named, idle = _worthwhile(logs, selection, noise, digits)
     after = [with_effects(pair, selection.fitted.chosen) for pair in pairs]  # held-out time stays unseen
     all_findings = [*named, *timestamps.saturated(pairs, after, selection.tried), *timestamps.dropped(pairs)]
-    all_findings += [one for one in digits if not is_of_simulation(one, pairs)]
+    all_findings += [f for f in digits if not is_of_simulation(f, pairs)]
     if not exact:
         all_findings += late_stamps(pairs) + vibration_above_band(logs, selection.whole.chosen)
     elif not any(finding.effect in RESONANT for finding in all_findings):
         all_findings += ringing(logs, after, settings.ringing)
     all_findings += batched(pairs, all_findings)
-    findings, both_have = [one for one in all_findings if not shared(one, sim_findings)], remarks(all_findings, sim_findings)
+    findings, both_have = [f for f in all_findings if not shared(f, sim_findings)], remarks(all_findings, sim_findings)
     both, chosen = zip(selection.selected, named, strict=True), selection.fitted.chosen
     clock = chosen[: selection.always]  # where logs share no epoch
-    expected_too = {one.effect.key for one, finding in both if shared(finding, sim_findings)} | {of.key for of, _ in clock}
+    expected_too = {f.effect.key for f, finding in both if shared(finding, sim_findings)} | {of.key for of, _ in clock}
     before = [with_effects(pair, tuple(entry for entry in chosen if entry[0].key in expected_too)) for pair in pairs]
     p_values = {str(signal): _p_value(findings, signal) for signal in SENSORS}
     baseline = [with_effects(pair, tuple(of for of in chosen if of[0].key in {JITTER, *expected_too})) for pair in pairs]
@@ -116,7 +116,7 @@ def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Fi
     or not, is the body's motion, or their own, as at a camera's rate.
     """
     (vibration,) = catalogue.diagnosed(["vibration"])
-    pair = max((log.pair for log in logs), key=lambda one: len(one.stamp_s))
+    pair = max((log.pair for log in logs), key=lambda line: len(line.stamp_s))
     several = len({log.pair.name for log in logs}) > 1
     if several or pair.band_hz is None or any(effect.key == vibration.key for effect, _ in chosen):
         return []
@@ -125,12 +125,12 @@ def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Fi
     log = WhitenedImu(replace(pair, real=residual + by_poses, band_hz=None), white)
     found = select_effects([log], [vibration])
     chance, power = pair.settings.search.false_discovery_rate, partial(line_power, pair.stamp_s, noise=white_noise(pair.real))
-    faster = [one for one in found.selected if one.theta[0] > pair.band_hz]
-    own = [one for one in faster if IN_POSES * power(pair.real, one.theta[0]) > power(by_poses, one.theta[0])]
+    faster = [line for line in found.selected if line.theta[0] > pair.band_hz]
+    own = [line for line in faster if IN_POSES * power(pair.real, line.theta[0]) > power(by_poses, line.theta[0])]
     tests = partial(line_p_value, residual, rate_hz), partial(steady_p_value, pair.stamp_s, residual)
-    clear = [one for one in own if all(p_value(one.theta[0]) < chance for p_value in tests)]
-    alone = [one for one in clear if not is_in_raw_poses(pair, residual, one.theta[0])]
-    return [finding_of([log], found, one, noise_floor([log])) for one in alone]
+    clear = [line for line in own if all(p_value(line.theta[0]) < chance for p_value in tests)]
+    alone = [line for line in clear if not is_in_raw_poses(pair, residual, line.theta[0])]
+    return [finding_of([log], found, line, noise_floor([log])) for line in alone]
 
 
 def physics_of_fitted_time(logs: Sequence[WhitenedImu], selection: Selection, d: Diagnosis) -> PhysicsFile:
@@ -140,10 +140,10 @@ def physics_of_fitted_time(logs: Sequence[WhitenedImu], selection: Selection, d:
     pairs = [log.pair for log in logs]
 
     def fitted(finding: Finding) -> Finding:
-        alike = [one for one in refitted if (one.effect.name, one.effect.equation) == (finding.effect, finding.equation)]
+        alike = [e for e in refitted if (e.effect.name, e.effect.equation) == (finding.effect, finding.equation)]
         if not alike:
             return finding
-        selected = next((one for one in alike if one.effect.sensors == (finding.signal,)), alike[-1])
+        selected = next((e for e in alike if e.effect.sensors == (finding.signal,)), alike[-1])
         curve = _curve(selected, selection.fitted)
         return msgspec.structs.replace(finding, parameters=_parameters(pairs, selected), curve=curve)
 
@@ -165,10 +165,10 @@ def _worthwhile(
 ) -> tuple[Selection, list[Finding], list[str]]:
     """Selection without effects of no held-out gain or of `digits`, its findings, and the former."""
     named, idle = [finding_of(logs, selection, selected, noise) for selected in selection.selected], []
-    while weak := [k for k, one in enumerate(named) if one.share <= 0.0 or any(is_of_digits(one, other) for other in digits)]:
-        least = min(weak, key=lambda k: named[k].share)
-        idle += [named[least].effect] if named[least].share <= 0.0 else []
-        name = selection.selected[least].effect.key
+    while weak := [k for k, f in enumerate(named) if f.share <= 0.0 or any(is_of_digits(f, other) for other in digits)]:
+        minimum = min(weak, key=lambda k: named[k].share)
+        idle += [named[minimum].effect] if named[minimum].share <= 0.0 else []
+        name = selection.selected[minimum].effect.key
         selection = without(selection, {name})
         named = [finding_of(logs, selection, selected, noise) for selected in selection.selected]
     return selection, named, idle
@@ -200,8 +200,8 @@ def finding_of(
             held_out = held_out_rms(logs, left_out, complete, signal)
             held_out_of_all = held_out_rms(logs, no_effects, complete, signal)
             noise = float(np.mean(floor[pairs[0].signals[signal]] ** 2))
-            most = max(held_out_of_all.rms_before, held_out.rms_before)  # effects may make up for one another
-            misfit = max(most**2 - noise, 1e-300)
+            maximum = max(held_out_of_all.rms_before, held_out.rms_before)  # effects may make up for one another
+            misfit = max(maximum**2 - noise, 1e-300)
             excess = held_out.rms_before**2 - held_out.rms_after**2
             shares.append((excess / noise, float(np.clip(excess / misfit, 0.0, 1.0)), signal, held_out))
     _, share, signal, held_out = max(shares, key=lambda entry: entry[0])
@@ -230,8 +230,8 @@ def with_similar(
     findings: Sequence[Finding], selection: Selection, similar: Mapping[str, tuple[str, ...]]
 ) -> tuple[Finding, ...]:
     """Findings with the other effects that would do as well, by the key of the selected effect."""
-    found = {(one.effect.name, one.effect.equation): similar.get(one.effect.key, ()) for one in selection.selected}
-    return tuple(msgspec.structs.replace(one, similar=found.get((one.effect, one.equation), ())) for one in findings)
+    found = {(e.effect.name, e.effect.equation): similar.get(e.effect.key, ()) for e in selection.selected}
+    return tuple(msgspec.structs.replace(e, similar=found.get((e.effect, e.equation), ())) for e in findings)
 
 
 def _onset_s(selected: SelectedEffect) -> float | None:

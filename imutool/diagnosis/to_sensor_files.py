@@ -148,8 +148,8 @@ def to_noise_file(d: Diagnosis) -> Noise | None:
     if not d.traces:
         return None
     rate_hz = 1.0 / float(np.median([np.median(np.diff(trace.t_s)) for trace in d.traces]))
-    left = np.concatenate([trace.real - trace.after for trace in d.traces])
-    std = np.nanstd(left, axis=0)
+    residual = np.concatenate([trace.real - trace.after for trace in d.traces])
+    std = np.nanstd(residual, axis=0)
     if not (std > 0.0).all():
         return None
     names = ", ".join(dict.fromkeys(trace.log for trace in d.traces))

@@ -25,7 +25,7 @@ from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
 from imutool.units import AXES, SENSORS, Sensor, three
 
 PHYSICS, NOISE = "physics.toml", "noise.toml"
-MOST_BIAS_M_S2 = 0.6 * GRAVITY_M_S2  # of an accelerometer; with a larger one it measures no gravity
+MAX_BIAS_M_S2 = 0.6 * GRAVITY_M_S2  # of an accelerometer; with a larger one it measures no gravity
 RATE_HZ = 200.0  # of a sensor whose rate neither the diagnosed noise nor the given one says
 DEVIATIONS = 2.0  # of a range
 Vector = Float64[np.ndarray, "3"]
@@ -110,7 +110,7 @@ def read(source: Path, noise: str | Path | None = None) -> Twin:
     biases = {s: np.array([getattr(file.bias, s) for file in files if file.bias is not None]).reshape(-1, 3) for s in SENSORS}
     known = {s: rows for s, rows in biases.items() if len(rows)}
     for folder, file in zip(folders, files, strict=True):
-        if file.bias is not None and (size := float(np.linalg.norm(file.bias.accel))) > MOST_BIAS_M_S2:
+        if file.bias is not None and (size := float(np.linalg.norm(file.bias.accel))) > MAX_BIAS_M_S2:
             what = f"{PHYSICS} has an accelerometer's bias of {size:.3g} m/s²: its log does not measure gravity, or not in m/s²"
             raise DataError(what, where=folder, fix="Correct the log with imutool convert LOG OUT --fix, and diagnose it again")
     mean = Bias(**{s: three(rows.mean(axis=0)) for s, rows in known.items()}) if known else None

@@ -97,12 +97,12 @@ def _work_quietly(task: Task, model: bytes | None) -> Result:
     return work(task, model)
 
 
-def _refuse_too_much(wanted: int, most: int) -> None:
-    if wanted > most:
+def _refuse_too_much(wanted: int, maximum: int) -> None:
+    if wanted > maximum:
         raise ConfigError(
             f"{wanted / 2**30:.2f} GiB are asked for each task",
             where="memory_bytes",
-            expected=f"at most {most / 2**30:.2f} GiB, which the largest machine has",
+            expected=f"at most {maximum / 2**30:.2f} GiB, which the largest machine has",
         )
 
 

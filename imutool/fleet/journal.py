@@ -236,9 +236,9 @@ class Journal:
 
 def _write_whole(file: IO[bytes], raw: bytes) -> None:
     """Write all bytes to a file without a buffer, which may take fewer at once."""
-    left = memoryview(raw)
-    while left:
-        left = left[file.write(left) :]
+    remaining = memoryview(raw)
+    while remaining:
+        remaining = remaining[file.write(remaining) :]
 
 
 def _encoded(line: _Line) -> bytes:
@@ -289,11 +289,9 @@ class _Pieces:
 
 def _difference(known: Run, settings: Settings) -> str:
     """Differences between settings, as old and new values."""
-    then, now = msgspec.to_builtins(known.settings), msgspec.to_builtins(settings)
-    changes = [
-        f"{name} {then[name]!r}, now {now[name]!r}" for name in now if then[name] != now[name] and name != "model_sha256"
-    ]
-    if then["model_sha256"] != now["model_sha256"] and not changes:
+    old, new = msgspec.to_builtins(known.settings), msgspec.to_builtins(settings)
+    changes = [f"{name} {old[name]!r}, now {new[name]!r}" for name in new if old[name] != new[name] and name != "model_sha256"]
+    if old["model_sha256"] != new["model_sha256"] and not changes:
         changes.append("another content of the model")
     if known.version != __version__:
         changes.append(f"imutool {known.version}, now {__version__}")

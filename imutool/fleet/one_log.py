@@ -28,8 +28,8 @@ from imutool.mcap_io.storage.target import Target
 from imutool.processes.system import peak_bytes, user
 from imutool.report import UNSET, Report, UnsetType, json_text, json_values
 
-MOST_LOSSES = 20  # stretches listed for a log; its metadata and its repair list all
-MOST_LETTERS = 300  # of what a page says
+MAX_LOSSES = 20  # stretches listed for a log; its metadata and its repair list all
+MAX_LETTERS = 300  # of what a page says
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[s
         report.write_page(report.name_by_topic(logs, topics), path, overwrite=True)
     except ImutoolError as error:
         return {"warnings": (*warnings, f"no page: {error}")}
-    return {"page": page_name(job.name), "page_says": conclusion(logs[0])[:MOST_LETTERS]}
+    return {"page": page_name(job.name), "page_says": conclusion(logs[0])[:MAX_LETTERS]}
 
 
 def _info(job: _Job) -> dict[str, Any]:
@@ -214,12 +214,12 @@ def _repair(job: _Job) -> dict[str, Any]:
 def _lost(losses: Mapping[str, Any] | None) -> dict[str, Any]:
     """Status, losses and warnings of a result, from the log's losses in JSON.
 
-    It lists at most `MOST_LOSSES` stretches.
+    It lists at most `MAX_LOSSES` stretches.
     """
     if not losses:
         return {}
     stretches, lines = losses["stretches"], []
-    for stretch in stretches[:MOST_LOSSES]:
+    for stretch in stretches[:MAX_LOSSES]:
         count = "an unknown number of" if stretch["messages"] is None else stretch["messages"]
         lines.append(f"byte {stretch['offset']}, {stretch['bytes']} bytes: {stretch['reason']} ({count} messages lost)")
     more = len(stretches) - len(lines) + losses["stretches_not_listed"]

@@ -14,7 +14,7 @@ import numpy as np
 from imutool import __version__
 from imutool.array_types import Float64
 from imutool.file_location import Location
-from imutool.fleet.results import MOST_ROWS, TROUBLE, Statistics
+from imutool.fleet.results import MAX_ROWS, TROUBLE, Statistics
 from imutool.fleet.robots import FEWEST, Comparison, Outlier
 from imutool.fleet.task import Result, Settings
 from imutool.mcap_io.storage.target import Target
@@ -22,7 +22,7 @@ from imutool.units import UNITS
 from imutool.viewing.html.drawing import prefix_ids, svg
 from imutool.viewing.html.page import AFTER, AXIS_COLORS, cards, document, text
 
-MOST_NAMED = 10  # robots with an effect
+MAX_NAMED = 10  # robots with an effect
 EQUAL = 1e-6  # of the largest of several values, by which they may differ
 BINS = 30
 OWN_STYLE = """
@@ -178,7 +178,7 @@ def _outliers(comparison: Comparison) -> Iterator[str]:
         yield f'<p class="note">{"None." if comparison.robots >= FEWEST else "Nobody can tell among so few."}</p>'
     else:
         head = "".join(f"<th>{row}</th>" for row in ("Robot", "What", "Here", "The others", "Distance", "False discovery"))
-        rows = "".join(_outlier(row) for row in comparison.outliers[:MOST_ROWS])
+        rows = "".join(_outlier(row) for row in comparison.outliers[:MAX_ROWS])
         yield f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
     if comparison.shared:
         yield "<h2>What all share</h2>"
@@ -192,7 +192,7 @@ def _outliers(comparison: Comparison) -> Iterator[str]:
         yield "<h2>What else was found</h2>"
         rows = "".join(
             f"<tr><td>{text(name.replace('_', ' '))}</td><td class=number>{len(robots)} of {comparison.robots}</td>"
-            f"<td>{text(', '.join(robots[:MOST_NAMED]))}{', …' if len(robots) > MOST_NAMED else ''}</td></tr>"
+            f"<td>{text(', '.join(robots[:MAX_NAMED]))}{', …' if len(robots) > MAX_NAMED else ''}</td></tr>"
             for name, robots in comparison.effects.items()
         )
         yield f"<table><thead><tr><th>Effect</th><th>Robots</th><th>Which</th></tr></thead><tbody>{rows}</tbody></table>"

@@ -21,7 +21,7 @@ from imutool.report import UNSET, Report, Section, UnsetType
 NAME = "fleet.parquet"
 ROWS = 4096  # in a group; of a million logs no more are held
 SCHEMA = "imutool.fleet-results/1"
-MOST_ROWS = 500  # in a table: more is for the Parquet file
+MAX_ROWS = 500  # in a table: more is for the Parquet file
 # columns that are null where they are empty
 MAY_LACK = ("target", "error", "target_sha256", "target_digest", "robot", "peak_bytes", "host")
 TROUBLE = ("failed", "quarantined", "lost")
@@ -165,14 +165,14 @@ class Statistics:
         self.statuses[status] += 1
         self.statuses["skipped"] += result.status == "skipped"
         self.peak_bytes = max(self.peak_bytes, result.peak_bytes)
-        if status in TROUBLE and len(self.trouble) < MOST_ROWS:
+        if status in TROUBLE and len(self.trouble) < MAX_ROWS:
             self.trouble.append(result)
         if status == "failed":
             return
         self.bytes_in, self.bytes_out = self.bytes_in + result.source_bytes, self.bytes_out + result.target_bytes
         self.messages += result.messages or 0
         self.pages += bool(result.page)
-        if result.page and len(self.drawn) < MOST_ROWS:
+        if result.page and len(self.drawn) < MAX_ROWS:
             self.drawn.append(result)
         self.seconds.append(result.seconds)
         self.speeds.append(result.source_bytes / 1e6 / max(result.seconds, 1e-9))

@@ -27,7 +27,7 @@ from imutool.fleet.task import FINAL, Result, Settings, Source, Task, failed
 from imutool.report import UNSET
 
 COMPARED, TITLE = "fleet.json", b"<title>Fleet "
-MOST_LISTED = 1000  # of the results with a problem, in JSON
+MAX_LISTED = 1000  # of the results with a problem, in JSON
 Tell = Callable[[int, int, str], None]
 Wording = Callable[[str], str]
 
@@ -189,7 +189,7 @@ def _report(
         every = (msgspec.structs.replace(result, error=wording(result.error)) for result in fleet.results(journal))
         pages.write(every, settings, page, out=out, seconds=seconds, source=source, comparison=comparison, overwrite=True)
     not_whole = (result for result in fleet.results(journal) if (result.earlier or result.status) != "ok")
-    first = tuple(result for result, _ in zip(not_whole, range(MOST_LISTED), strict=False))
+    first = tuple(result for result, _ in zip(not_whole, range(MAX_LISTED), strict=False))
     return FleetReport(source, out, settings.command, progress, seconds, first, comparison)
 
 

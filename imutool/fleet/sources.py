@@ -105,8 +105,8 @@ def find(text: str, out: Location, *, bags: bool = False, once: bool = False) ->
         expected = "a log, a folder with logs, or a pattern that fits some"
         raise ConfigError(f"no {' or '.join(endings)} log", where=text, expected=expected, fix=CONVERT if passed_over else "")
     if outputs and not exists(out / JOURNAL):  # they are no results of a fleet
-        told = redact(text), outputs, redact(str(out))
-        logger.warning("%s: of its logs %d are left out, for they lie below OUT (%s); choose an OUT beside the logs", *told)
+        redacted = redact(text), outputs, redact(str(out))
+        logger.warning("%s: of its logs %d are left out, for they lie below OUT (%s); choose an OUT beside the logs", *redacted)
     if passed_over:
         kinds = ", ".join(f"{count} {ending}" for ending, count in passed_over.items())
         logger.warning("%s: files that are no MCAP logs are passed over (%s); %s", redact(text), kinds, CONVERT)

@@ -208,10 +208,10 @@ def _half_cot(s: Angles2) -> Angles2:
 def _atan2_over(n2: Float[Tensor, "*batch"], w: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """atan2(n, w) / n from n² and w >= 0; for small n / w as (1 / w) (1 - r²/3 + r⁴/5 - ...)."""
     small = n2 < _ATAN_BELOW * w.square()
-    one = torch.ones_like(n2)
-    w_small = torch.where(small, w, one)
+    ones = torch.ones_like(n2)
+    w_small = torch.where(small, w, ones)
     ratio2 = torch.where(small, n2, torch.zeros_like(n2)) / w_small.square()
-    n = torch.where(small, one, n2).sqrt()
+    n = torch.where(small, ones, n2).sqrt()
     return torch.where(small, _horner(_terms(_ATAN, n2.dtype), ratio2) / w_small, torch.atan2(n, w) / n)
 
 

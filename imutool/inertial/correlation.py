@@ -9,7 +9,7 @@ from scipy.signal import correlate, correlation_lags, periodogram
 
 from imutool.array_types import Bool, Float64, Int64
 
-LEAST_ALIKE = 0.25  # of the size of two autocorrelations, that their product sums to: it scatters where both are lines
+MIN_ALIKE = 0.25  # of the size of two autocorrelations, that their product sums to: it scatters where both are lines
 NEARLY_ONE = 1.0 - 1e-9  # correlation whose Fisher transform is finite
 DEGREES = 3.0  # of freedom that Fisher's z loses
 Column = Float64[np.ndarray, " _"]
@@ -31,8 +31,8 @@ class Correlation(NamedTuple):
         return int(self.lag[at]), float(self.value[at]), float(self.sigma[at])
 
 
-def cross_correlation(a: Column, b: Column, least: int) -> Correlation:
-    """Correlation over the samples that both have at a lag; 0 where they are fewer than `least`.
+def cross_correlation(a: Column, b: Column, minimum: int) -> Correlation:
+    """Correlation over the samples that both have at a lag; 0 if fewer than `minimum`.
 
     Each overlap has its own mean and size, so that a short signal is found in a long one.
     """
@@ -46,7 +46,7 @@ def cross_correlation(a: Column, b: Column, least: int) -> Correlation:
     product = correlate(b, a, mode="full") - sum_a * sum_b / count
     power_a, power_b = squares_a - sum_a**2 / count, squares_b - sum_b**2 / count
     size = np.sqrt(np.maximum(power_a, 0.0) * np.maximum(power_b, 0.0))
-    shown = (count >= least) & (size > 1e-9 * np.sqrt(float(a @ a) * float(b @ b)))
+    shown = (count >= minimum) & (size > 1e-9 * np.sqrt(float(a @ a) * float(b @ b)))
     value = np.where(shown, product / np.where(shown, size, 1.0), 0.0).clip(-NEARLY_ONE, NEARLY_ONE)
     independent = np.maximum(count / dependent_samples(a, b) - DEGREES, 0.0)
     return Correlation(lags, value, np.arctanh(value) * np.sqrt(independent))
@@ -59,7 +59,7 @@ def dependent_samples(a: Column, b: Column) -> float:
     """
     n = min(len(a), len(b)) // 2
     rho_a, rho_b = (correlate(v, v, mode="full")[v.size :][:n] / max(float(v @ v), 1e-300) for v in (a, b))
-    alike = max(float((rho_a * rho_b).sum()), LEAST_ALIKE * float(np.linalg.norm(rho_a) * np.linalg.norm(rho_b)))
+    alike = max(float((rho_a * rho_b).sum()), MIN_ALIKE * float(np.linalg.norm(rho_a) * np.linalg.norm(rho_b)))
     return 1.0 + 2.0 * alike
 
 
@@ -78,7 +78,7 @@ def time_ahead_s(x: Float64[np.ndarray, "n ..."], y: Float64[np.ndarray, "n ..."
 def is_white(
     residual: Float64[np.ndarray, "n k"],
     noise: Float64[np.ndarray, " k"],
-    least: Float64[np.ndarray, " k"],
+    minimum: Float64[np.ndarray, " k"],
     bands: int,
     factor: float,
     chance: float,
@@ -86,11 +86,11 @@ def is_white(
     """Whether a residual is white, has no line, and is only noise at low frequencies.
 
     It is white if no band is louder than `factor` times the quietest of `bands` bands. A misfit of a motion is loud at low
-    frequencies, or near Nyquist, where poses lose impacts. Less than `least` is no misfit.
+    frequencies, or near Nyquist, where poses lose impacts. Less than `minimum` is no misfit.
     """
     f, power = periodogram(residual, fs=2.0, axis=0)  # white noise has its variance at each frequency
-    parts, least = np.stack([part.mean(axis=0) for part in np.array_split(power[1:], bands)]), least**2
+    parts, minimum = np.stack([part.mean(axis=0) for part in np.array_split(power[1:], bands)]), minimum**2
     fast = power[f > 1.0 / bands]
-    line = len(fast) * np.exp(-fast.max(axis=0) / np.maximum(fast.mean(axis=0), least))
-    alike = (parts < factor**2 * np.maximum(parts.min(axis=0), least)).all()
-    return bool(alike and (parts[0] < factor**2 * np.maximum(noise**2, least)).all() and line.min() > chance)
+    line = len(fast) * np.exp(-fast.max(axis=0) / np.maximum(fast.mean(axis=0), minimum))
+    alike = (parts < factor**2 * np.maximum(parts.min(axis=0), minimum)).all()
+    return bool(alike and (parts[0] < factor**2 * np.maximum(noise**2, minimum)).all() and line.min() > chance)

@@ -49,8 +49,8 @@ STOPPED[:, VELOCITY] = np.eye(3)
 STILL = np.zeros((3, SIZE))  # rows of d(gyro bias at rest)/d(error)
 STILL[:, 9:12] = STILL[:, 15:18] = np.eye(3)
 HUBER = 2.0  # standard deviations of a speed, above which it gets less weight
-LEAST_FORCE_M_S2 = 1e-6  # below, a mean specific force has no direction
-LEAST_VARIANCE = 1e-14  # that a step adds to every error: keeps the covariance invertible
+MIN_FORCE_M_S2 = 1e-6  # below, a mean specific force has no direction
+MIN_VARIANCE = 1e-14  # that a step adds to every error: keeps the covariance invertible
 MISSING_RAD_S, MISSING_M_S2 = 2.0, 10.0  # standard deviation of the motion during missing samples
 PAUSE_RAD, PAUSE_M_S, PAUSE_M = 0.3, 3.0, 1e3  # of turn, velocity and (at most) position over a gap in which the pose stays
 
@@ -147,7 +147,7 @@ def level(accel: Vector3, x: State, s: FilterSettings) -> State:
     """
     force = accel - x.bias[3:]
     size = float(np.linalg.norm(force))
-    if size < LEAST_FORCE_M_S2:  # no direction at all
+    if size < MIN_FORCE_M_S2:  # no direction at all
         force, size = np.array([0.0, 0.0, 1.0]), 1.0
     up_b = force / size
     axis = np.array([up_b[1], -up_b[0], 0.0])  # up_b x z
@@ -178,11 +178,11 @@ def motion_step(x: State, motion: Increment, rate: Vector3, missing_s: float, wa
     return _with_velocity(step, H, step.expected.v_w + matvec(steady, x.steady), noise, HUBER)
 
 
-def _with_velocity(step: Step, H: Float64[np.ndarray, "... 3 m"], v: Vector3, noise: float, most: float) -> Step:
-    """Step after a velocity that is zero but for `noise` per axis; with less weight above `most` standard deviations."""
+def _with_velocity(step: Step, H: Float64[np.ndarray, "... 3 m"], v: Vector3, noise: float, maximum: float) -> Step:
+    """Step after a velocity that is zero but for `noise` per axis; with less weight above `maximum` standard deviations."""
     S = H @ step.expected.P[..., :SIZE, :SIZE] @ H.swapaxes(-1, -2) + noise * EYE
     size = np.sqrt(np.einsum("...i,...i->...", v, v) / np.einsum("...ii->...", S))
-    after = update(step.expected, H, v, noise * np.maximum(1.0, size / most)[..., None] ** 2 * ONES)
+    after = update(step.expected, H, v, noise * np.maximum(1.0, size / maximum)[..., None] ** 2 * ONES)
     return step._replace(after=after, innovation=(v, S))
 
 
@@ -192,7 +192,7 @@ def rest_step(x: State, mean: Vector6, variance: Vector3, T: float, walk: Walk, 
     by_bias = np.zeros((*dv.shape[:-1], 9, 6))
     by_bias[..., VELOCITY, 3:], by_bias[..., POSITION, 3:] = -T * EYE, -0.5 * T**2 * EYE
     push = s.accel_density**2 * T
-    step = _predict(x, x.R_wb, dv, 0.5 * T * dv, by_bias, T, (LEAST_VARIANCE, push), walk, resting=True)
+    step = _predict(x, x.R_wb, dv, 0.5 * T * dv, by_bias, T, (MIN_VARIANCE, push), walk, resting=True)
     step = _with_velocity(step, STOPPED, step.expected.v_w, s.rest_m_s**2, math.inf)
     rate = step.after.rest_bias(True)[..., :3] - mean[..., :3]
     return step._replace(after=update(step.after, STILL, rate, variance + s.rest_rad_s**2))
@@ -229,7 +229,7 @@ def _predict(
     of_noise[..., :3], of_noise[..., 3:] = np.asarray(noise[0])[..., None], noise[1]
     P[..., POSE, POSE] += (by_noise * of_noise[..., None, :]) @ by_noise.swapaxes(-1, -2)
     variances, walked = np.einsum("...ii->...i", P), walk**2 * T
-    variances += LEAST_VARIANCE
+    variances += MIN_VARIANCE
     variances[..., BIAS] += walked[:6]
     if len(walked) > 6:
         variances[..., SIZE:] += walked[6:]
@@ -278,20 +278,20 @@ def smooth(steps: Sequence[Step]) -> list[State]:
 def pause_step(x: State, T: float, walk: Walk) -> Step:
     """Step over a gap of T seconds in the samples: the state stays, less certain of its pose."""
     std = np.repeat([PAUSE_RAD, PAUSE_M_S, min(PAUSE_M_S * T, PAUSE_M)], 3)
-    noise = np.concatenate([std**2, walk[:6] ** 2 * T, np.zeros(12), walk[6:] ** 2 * T]) + LEAST_VARIANCE
+    noise = np.concatenate([std**2, walk[:6] ** 2 * T, np.zeros(12), walk[6:] ** 2 * T]) + MIN_VARIANCE
     expected = replace(x, P=x.P + np.diag(noise))
     return Step(x, expected, np.eye(len(x.P)), expected)
 
 
-def reset_pose(x: State, accel: Vector3, T: float, walk: Vector6, most: Vector6, s: FilterSettings) -> Step:
+def reset_pose(x: State, accel: Vector3, T: float, walk: Vector6, maximum: Vector6, s: FilterSettings) -> Step:
     """Reset of the pose after a gap of T seconds in the samples; the biases stay.
 
-    The variance of b grows by walk² T, up to `most`, the variance of a run's bias before its first sample.
+    The variance of b grows by walk² T, up to `maximum`, the variance of a run's bias before its first sample.
     """
     fresh = level(accel, x, s)
-    P = fresh.P + LEAST_VARIANCE * np.eye(SIZE)
+    P = fresh.P + MIN_VARIANCE * np.eye(SIZE)
     grown = np.arange(9, 15)
-    P[grown, grown] += np.minimum(walk**2 * T, np.maximum(most - P[grown, grown], 0.0))
+    P[grown, grown] += np.minimum(walk**2 * T, np.maximum(maximum - P[grown, grown], 0.0))
     F = np.zeros((SIZE, SIZE))
     F[9:, 9:] = np.eye(SIZE - 9)
     fresh = replace(fresh, P=P)

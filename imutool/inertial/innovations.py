@@ -10,12 +10,12 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.inertial.inertial_filter import SIZE, STILL, Step
-from imutool.inertial.stationary import MOST_SHAKING
+from imutool.inertial.stationary import MAX_SHAKING
 
 STUDENT = 7.0  # degrees of freedom of the likelihood, so that one jolt does not decide
 SURPRISING = 7.81  # chi-square of three that one innovation in twenty exceeds: above, it gets less weight
 LAGS = 6  # blocks over which innovations depend on each other: the bounded velocity is no white noise
-LEAST_DRIVEN_M_S, DRIVEN = 0.5, 11.3  # speed, and its chi-square, which a body at rest exceeds once in a hundred times
+MIN_DRIVEN_M_S, DRIVEN = 0.5, 11.3  # speed, and its chi-square, which a body at rest exceeds once in a hundred times
 DRIVEN_M_S = 2.0  # speed that is no error of the filter
 TURNS = 25.0  # chi-square of a rate beside the bias so far, which no vibration makes
 
@@ -58,7 +58,7 @@ class DriveDetector:
     def __call__(self, samples: Float64[np.ndarray, "n 6"], step: Step) -> bool:
         """Whether a body drives, from the samples of a block and the filter's step of it at rest."""
         noise = np.sqrt(samples.var(axis=0).reshape(2, 3).sum(axis=1))
-        shakes, self._calmest = bool((noise > MOST_SHAKING * self._calmest).any()), np.minimum(noise, self._calmest)
+        shakes, self._calmest = bool((noise > MAX_SHAKING * self._calmest).any()), np.minimum(noise, self._calmest)
         if not shakes or step.innovation is None:
             return False
         rate = samples[:, :3].mean(axis=0) - step.expected.rest_bias(True)[:3]
@@ -67,7 +67,7 @@ class DriveDetector:
             return True
         v_w, S = step.innovation
         speed = float(np.linalg.norm(v_w))
-        return speed > DRIVEN_M_S or bool(speed > LEAST_DRIVEN_M_S and v_w @ np.linalg.solve(S, v_w) > DRIVEN)
+        return speed > DRIVEN_M_S or bool(speed > MIN_DRIVEN_M_S and v_w @ np.linalg.solve(S, v_w) > DRIVEN)
 
 
 class Share(NamedTuple):

@@ -173,17 +173,17 @@ def attitude_by_gyro(
     return np.asarray(level.as_matrix() @ R_0b)
 
 
-def gravity_error(R_wb: Float64[np.ndarray, "n 3 3"], y: Vectors, least: float) -> Float64[np.ndarray, "3"]:
+def gravity_error(R_wb: Float64[np.ndarray, "n 3 3"], y: Vectors, minimum: float) -> Float64[np.ndarray, "3"]:
     """By how much a simulator's own gravity differs from the usual one (m/s², world frame).
 
     `y` is what its accelerometer reads beyond its motion, with a constant of the body. If another gravity gains fewer than
-    `least` squares of noise, it is the nearest of those that simulators have.
+    `minimum` squares of noise, it is the nearest of those that simulators have.
     """
     R_wb, y = (x[:: len(y) // 20_000 + 1] for x in (R_wb, y))
     columns = np.concatenate([R_wb.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R_wb.shape)], axis=2)
     found = np.asarray(np.linalg.lstsq(columns.reshape(-1, 6), y.ravel(), rcond=1e-6)[0])
-    without, left = y.var(axis=0).mean(), np.square(y - columns @ found).mean()
-    if (without - left) * y.size > least * left:
+    without, remaining = y.var(axis=0).mean(), np.square(y - columns @ found).mean()
+    if (without - remaining) * y.size > minimum * remaining:
         return found[:3]
     return np.array([0.0, 0.0, min((g - GRAVITY_M_S2 for g in GRAVITIES_M_S2), key=lambda more: abs(more - found[2]))])
 

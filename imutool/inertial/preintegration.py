@@ -23,7 +23,7 @@ EYE = np.eye(3)
 HATS = np.cross(EYE[:, None], EYE[None]).swapaxes(1, 2).reshape(3, 9)  # hat(x), row by row, is x @ HATS: one product
 CROSS = -HATS  # from all products of two vectors' axes to their cross product: eps_iab x_ab
 SMALL_RAD2 = 1e-8  # below, two terms of the series are exact to 1e-17
-LEAST_RAD2 = 1e-300  # added to a square, so that sin(x) / x is 1 at zero
+MIN_RAD2 = 1e-300  # added to a square, so that sin(x) / x is 1 at zero
 
 
 class Increment(NamedTuple):
@@ -60,7 +60,7 @@ def exp(xi: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"
 
 
 def _length(xi: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch"]:
-    return np.asarray(np.sqrt(np.einsum("...i,...i->...", xi, xi) + LEAST_RAD2))
+    return np.asarray(np.sqrt(np.einsum("...i,...i->...", xi, xi) + MIN_RAD2))
 
 
 def _rotation(xi: Float64[np.ndarray, "*batch 3"], angle: Float64[np.ndarray, "*batch"]) -> Float64[np.ndarray, "*batch 3 3"]:

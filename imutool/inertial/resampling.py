@@ -12,7 +12,7 @@ from scipy.signal import periodogram
 from imutool.array_types import Float64
 
 AS_GOOD = 2.0  # root of the squares, in units of a recording's noise, that the spline may add to all of its samples
-MOST_FACTOR = 8
+MAX_FACTOR = 8
 
 
 def refined(x: Float64[np.ndarray, "n k"], noise: Float64[np.ndarray, " k"], count: int) -> Float64[np.ndarray, "m k"]:
@@ -40,11 +40,11 @@ def refinement(x: Float64[np.ndarray, "n k"], noise: Float64[np.ndarray, " k"], 
     frequencies.
     """
     share, power = periodogram(x, 1.0, "hann", axis=0)
-    factor, most = 1, AS_GOOD / np.sqrt(count) * noise
-    while factor < MOST_FACTOR:
+    factor, maximum = 1, AS_GOOD / np.sqrt(count) * noise
+    while factor < MAX_FACTOR:
         f = share / factor
         lost = 1.0 - np.sinc(f) ** 4 / (2.0 / 3.0 + np.cos(2.0 * np.pi * f) / 3.0)
-        if (np.sqrt(2.0 * (lost**2 @ power) * share[1]) <= most).all():
+        if (np.sqrt(2.0 * (lost**2 @ power) * share[1]) <= maximum).all():
             break
         factor *= 2
     return factor

@@ -28,17 +28,17 @@ from imutool.recording import Imu, nanoseconds
 from imutool.recording.columns import quantile, true_ranges
 
 WHITE_MARGIN = 1.3  # ratio of block means to white noise; with 10 blocks of 3 axes, equally noisy, it scatters by 0.14
-LEAST_VARIANCE = 1e-300  # of a window that is stuck
+MIN_VARIANCE = 1e-300  # of a window that is stuck
 TREND_DEVIATIONS = 4.0  # of the difference of two means; real stops reach 2.1, a slow turn that changes 11
 FLOOR_MARGIN = 2.5  # ratio to the calmest windows of the log
 FLOOR_RANK = 10  # rank of the window that sets the floor: a single stuck window must not
 NOISE_BLOCK, CALMEST = 20, 0.25
 CALM = 1.2  # times `white_noise`, that pure white noise is
-MEANS, LEAST_MEANS = (20, 200), 8  # samples of a mean of noise, and how many means there are at least
+MEANS, MIN_MEANS = (20, 200), 8  # samples of a mean of noise, and how many means there are at least
 TOLERATED_MEAN = 1.8  # by which they may scatter more than noise is measured, which finds five sixths of it
-MOST_DRIFT = np.array([0.1] * 3 + [0.5] * 3)  # rad/s, m/s²: plausible sizes of a bias and of its drift
+MAX_DRIFT = np.array([0.1] * 3 + [0.5] * 3)  # rad/s, m/s²: plausible sizes of a bias and of its drift
 KEPT_MEANS, COMPARED_MEANS = 1000, 100  # of windows at rest: kept by a live detector, and compared with each other
-MOST_SHAKING = 1.5  # noise at rest, by that of the calmest stop: white noise scatters to 1.3, idling cars drive with 1.9
+MAX_SHAKING = 1.5  # noise at rest, by that of the calmest stop: white noise scatters to 1.3, idling cars drive with 1.9
 REPEATED_RAD_S, OFTEN = 4e-3, 0.05  # means that are alike; share of the commonest's windows that a bias has at least
 GAP_PERIODS = 3.0  # a longer step between samples breaks a window
 
@@ -142,13 +142,13 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
         & ~np.lib.stride_tricks.sliding_window_view(blocks.late, width).any(axis=-1)
     )
     if rests.any():  # a turn-on bias does not jump: an outlier among the resting windows is a steady turn
-        apart = np.linalg.norm(gyro_mean - _rate_at_rest(gyro_mean[rests], noise[:, rests]), axis=1)
-        rests &= apart <= settings.gyro_agreement_rad_s
+        distance = np.linalg.norm(gyro_mean - _rate_at_rest(gyro_mean[rests], noise[:, rests]), axis=1)
+        rests &= distance <= settings.gyro_agreement_rad_s
     resting_blocks = np.zeros(count, bool)
     for shift in range(width):
         resting_blocks[shift : shift + len(rests)] |= rests
-    least_ns = nanoseconds(settings.min_s - 2 * period_s)
-    return [(a, b) for a, b in true_ranges(resting_blocks) if blocks.last_ns[b - 1] - blocks.first_ns[a] >= least_ns]
+    min_ns = nanoseconds(settings.min_s - 2 * period_s)
+    return [(a, b) for a, b in true_ranges(resting_blocks) if blocks.last_ns[b - 1] - blocks.first_ns[a] >= min_ns]
 
 
 class OnlineRestDetector:
@@ -225,7 +225,7 @@ def _rate_at_rest(means: Float64[np.ndarray, "n 3"], noise: Float64[np.ndarray, 
     bias is large.
     """
     calmest = np.sort(noise, axis=1)[:, min(FLOOR_RANK, len(means) // 10), None]
-    calm = means[(noise <= MOST_SHAKING * calmest).all(axis=0)]
+    calm = means[(noise <= MAX_SHAKING * calmest).all(axis=0)]
     calm = calm if len(calm) else means
     some = calm[:: -(-len(calm) // COMPARED_MEANS)]
     alike = (np.linalg.norm(some[:, None] - some, axis=2) <= REPEATED_RAD_S).sum(axis=1)
@@ -246,10 +246,10 @@ def white_noise(values: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]
     return np.asarray(np.sqrt(quantile(blocks, CALMEST) / 6.0))
 
 
-def nothing_but_noise(x: Float64[np.ndarray, " n"], least: float = 0.0) -> bool:
+def nothing_but_noise(x: Float64[np.ndarray, " n"], minimum: float = 0.0) -> bool:
     """Whether means of a signal scatter no more than means of white noise."""
-    noise = max(float(white_noise(x[:, None])[0]), least)
-    sizes = [size for size in (*MEANS, len(x) // LEAST_MEANS) if 0 < size <= len(x) // LEAST_MEANS]
+    noise = max(float(white_noise(x[:, None])[0]), minimum)
+    sizes = [size for size in (*MEANS, len(x) // MIN_MEANS) if 0 < size <= len(x) // MIN_MEANS]
     means = (x[: len(x) // size * size].reshape(-1, size).mean(axis=1) for size in sizes)
     return all(float(mean.std()) <= TOLERATED_MEAN * noise / np.sqrt(size) for mean, size in zip(means, sizes, strict=True))
 
@@ -258,7 +258,7 @@ def may_rest(imu: Imu) -> bool:
     """Whether a sensor may rest with biases that drift: means of half a second hardly change."""
     samples, count = np.concatenate([imu.gyro, imu.accel], axis=1), min(len(imu), round(0.5 / imu.period_s) + 1)
     means = samples[: len(samples) // count * count].reshape(-1, count, 6).mean(axis=1)
-    return bool((np.abs(means - np.median(means, axis=0)) < MOST_DRIFT).all())
+    return bool((np.abs(means - np.median(means, axis=0)) < MAX_DRIFT).all())
 
 
 def _white_margin(variances: Float64[np.ndarray, "*w 3"]) -> Float64[np.ndarray, "*w"]:
@@ -266,7 +266,7 @@ def _white_margin(variances: Float64[np.ndarray, "*w 3"]) -> Float64[np.ndarray,
 
     It scatters as fewer axes do where one is much noisier than the others: by sqrt(3 sum(s^4)) / sum(s^2) times as much.
     """
-    total = np.maximum(variances.sum(axis=-1), LEAST_VARIANCE)
+    total = np.maximum(variances.sum(axis=-1), MIN_VARIANCE)
     return np.asarray(1.0 + (WHITE_MARGIN - 1.0) * np.sqrt(3.0 * (variances**2).sum(axis=-1)) / total)
 
 

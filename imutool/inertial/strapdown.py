@@ -25,7 +25,7 @@ from imutool.recording.columns import median
 GRAVITY_W = (0.0, 0.0, -GRAVITY_M_S2)
 VELOCITY_WINDOW_S = 0.2
 VELOCITY_ORDER = 3
-COMPARED_S, LEAST_SPEED_M_S, MOST_OFF = 1.0, 0.05, 0.5  # of velocities and positions: over a second, in motion, by the median
+COMPARED_S, MIN_SPEED_M_S, MAX_OFF = 1.0, 0.05, 0.5  # of velocities and positions: over a second, in motion, by the median
 WINDOWS_AT_ONCE = 1 << 12  # whose arrays fit a core's cache
 SAMPLES_PER_COEFFICIENT = 3  # a stretch shorter than the window gets a lower order, against noise
 
@@ -232,7 +232,7 @@ def velocity_follows(poses: Poses) -> bool:
         path = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (v[1:] + v[:-1]) * dt, axis=0)])
         moved, stated = ((x[ends] - x[:n]) / (t[rows][ends] - t[rows][:n])[:, None] for x in (p, path))
         speed[start : start + n], off[start : start + n] = quaternion.length(moved), quaternion.length(moved - stated)
-    return not len(speed) or bool(median(speed) < LEAST_SPEED_M_S or median(off) < MOST_OFF * median(speed))
+    return not len(speed) or bool(median(speed) < MIN_SPEED_M_S or median(off) < MAX_OFF * median(speed))
 
 
 def truth_velocity(poses: Poses) -> Vectors:

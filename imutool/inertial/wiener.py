@@ -24,7 +24,7 @@ INDEPENDENT = 0.5, 0.65  # of such Hann windows, and of their neighbouring frequ
 CHANCE = 1e-4  # of noise to share more at one frequency
 APART = 2  # times the frequencies of a mean: so far from what is shared, nothing of a motion is left in what is not
 ALMOST_ALL, NO_NOISE = 0.9, 1e-12  # of the frequencies, which a recording shares; of the largest power, as good as none
-STEPS, LEAST_SAMPLES, MOST_S = 4, 100, 0.5  # of a fit of two clocks; a larger difference is none of their rates
+STEPS, MIN_SAMPLES, MAX_S = 4, 100, 0.5  # of a fit of two clocks; a larger difference is none of their rates
 SLOW_HZ = 8.0  # of the rates by which they are compared: a vibration has another delay one period later
 SMOOTH = 3  # times the frequencies of a mean: over which noise is taken to have one density
 Parts = Complex128[np.ndarray, "f t k"]
@@ -48,12 +48,12 @@ class _Shared(NamedTuple):
 class NoiseLeft(NamedTuple):
     """One-sided density of the noise that a filter leaves, by frequency: a motion hides it.
 
-    `most` bounds the deviation of a sample's noise before the filter: what a recording does not share, and what is filtered.
+    `maximum` bounds the deviation of a sample's noise before the filter: what a recording does not share, and what is filtered.
     """
 
     f_hz: Float64[np.ndarray, " f"]
     density: Float64[np.ndarray, "f k"]
-    most: Float64[np.ndarray, " k"] | float = np.inf
+    maximum: Float64[np.ndarray, " k"] | float = np.inf
 
 
 def wiener_filter(
@@ -96,7 +96,7 @@ def denoised(
     inside = slice(stft.lower_border_end[1], stft.upper_border_begin(len(mirrored))[1])  # beyond, a motion is cut off
     all_of_it = density * (np.abs(parts[:, inside]) ** 2).mean(axis=1)
     top = density * _top_power(parts, settings)
-    std, untold = _noise_std(parts, with_recorded, settings, white=not of_poses)
+    std, unknown = _noise_std(parts, with_recorded, settings, white=not of_poses)
     std = std[:, None]
     parts /= std
     power = np.einsum("fti,ftj->fij", parts, parts.conj()) / parts.shape[1]
@@ -107,19 +107,19 @@ def denoised(
     parts = parts @ kept.swapaxes(1, 2)
     noise = np.abs(np.diagonal(kept, axis1=1, axis2=2))[:, None, :]
     around_each = (settings.short_time_parts, settings.short_time_parts, 1)
-    here = uniform_filter(np.abs(parts) ** 2, around_each, mode="nearest")
-    gain = np.where(here < MOSTLY * noise, 0.0, 1.0 - noise / np.maximum(here, 1e-300))
+    local_power = uniform_filter(np.abs(parts) ** 2, around_each, mode="nearest")
+    gain = np.where(local_power < MOSTLY * noise, 0.0, 1.0 - noise / np.maximum(local_power, 1e-300))
     if of_poses_to_hz is not None and shared is not None:
         gain *= (~_apart(shared, settings) & (stft.f <= of_poses_to_hz)[:, None])[:, None]
     clean = stft.istft(np.moveaxis(gain * parts * std, 1, 2), k1=n + 2 * size, f_axis=0, t_axis=2)
-    left = density * (std[:, 0] ** 2) * (gain**2).mean(axis=1) * noise[:, 0]
-    most: Float64[np.ndarray, " k"] | float = np.inf
-    left = np.where(untold, np.minimum(2.0 * (CALM * white_noise(x)) ** 2 / rate_hz, top), left)
+    remaining = density * (std[:, 0] ** 2) * (gain**2).mean(axis=1) * noise[:, 0]
+    maximum: Float64[np.ndarray, " k"] | float = np.inf
+    remaining = np.where(unknown, np.minimum(2.0 * (CALM * white_noise(x)) ** 2 / rate_hz, top), remaining)
     if with_recorded is not None:  # noise is not shared: a vibration looks like white noise, and a recording shares it
         unshared = with_recorded.own * uniform_filter1d(all_of_it, settings.short_time_parts, axis=0, mode="nearest")
-        filtered = np.where(untold, top * rate_hz / 2.0, trapezoid(density * std[:, 0] ** 2, stft.f, axis=0))
-        left, most = np.minimum(left, unshared), np.sqrt(np.minimum(trapezoid(unshared, stft.f, axis=0), filtered))
-    return np.asarray(line + clean[size : size + n]), NoiseLeft(stft.f, left, most)
+        filtered = np.where(unknown, top * rate_hz / 2.0, trapezoid(density * std[:, 0] ** 2, stft.f, axis=0))
+        remaining, maximum = np.minimum(remaining, unshared), np.sqrt(np.minimum(trapezoid(unshared, stft.f, axis=0), filtered))
+    return np.asarray(line + clean[size : size + n]), NoiseLeft(stft.f, remaining, maximum)
 
 
 def _line(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "n k"]:
@@ -158,21 +158,21 @@ def _drift_s(
     """
     inside = (t_s >= own_s[0]) & (t_s <= own_s[-1])
     rate_hz, at = float((len(t_s) - 1) / np.ptp(t_s)), t_s[inside]
-    if len(at) < LEAST_SAMPLES or not np.ptp(gyro, axis=0).all():
+    if len(at) < MIN_SAMPLES or not np.ptp(gyro, axis=0).all():
         return np.zeros(len(own_s))
     slow = butter(2, min(SLOW_HZ, 0.4 * rate_hz), fs=rate_hz, output="sos")
     read = sosfiltfilt(slow, np.stack([np.interp(at, own_s, column) for column in recorded.T], axis=1), axis=0)
     rate, line, squares = make_interp_spline(t_s, sosfiltfilt(slow, gyro, axis=0), k=3), np.zeros(2), []
     since = np.column_stack([np.ones(len(at)), (at - at.mean()) / np.ptp(at)])
     for _ in range(STEPS):
-        now = np.clip(at + since @ line, t_s[0], t_s[-1])
-        A = np.column_stack([rate(now), np.ones(len(at))])
+        warped = np.clip(at + since @ line, t_s[0], t_s[-1])
+        A = np.column_stack([rate(warped), np.ones(len(at))])
         M = np.linalg.lstsq(A, read, rcond=None)[0]
-        left, slope = read - A @ M, rate(now, 1) @ M[:3]
-        squares.append(float((left**2).sum()))
+        residual, slope = read - A @ M, rate(warped, 1) @ M[:3]
+        squares.append(float((residual**2).sum()))
         columns = np.stack([since[:, j, None] * slope for j in (0, 1)], axis=2).reshape(-1, 2)
-        line = line + np.linalg.lstsq(columns, left.ravel(), rcond=None)[0]
-    moved = 1.0 / rate_hz < abs(line).max() < MOST_S and squares[-1] < squares[0]
+        line = line + np.linalg.lstsq(columns, residual.ravel(), rcond=None)[0]
+    moved = 1.0 / rate_hz < abs(line).max() < MAX_S and squares[-1] < squares[0]
     return line[0] + (own_s - at.mean()) / np.ptp(at) * line[1] if moved else np.zeros(len(own_s))
 
 
@@ -186,7 +186,7 @@ def _noise_std(
     filter takes none of it.
     """
     power = np.median(np.abs(parts) ** 2, axis=1) / np.log(2.0)  # a shock is no noise of other times
-    out, untold = np.tile(_top_power(parts, settings), (len(parts), 1)), np.zeros(parts.shape[2], bool)
+    out, unknown = np.tile(_top_power(parts, settings), (len(parts), 1)), np.zeros(parts.shape[2], bool)
     for k, (column, unexplained) in enumerate(zip(shared.shared.T, shared.own.T, strict=True) if shared is not None else ()):
         own = np.flatnonzero(_apart(column, settings))
         beyond_chance = column.sum() > settings.short_time_parts  # frequencies whose means overlap
@@ -194,11 +194,11 @@ def _noise_std(
             level = median_filter(power[own, k], SMOOTH * settings.short_time_parts, mode="nearest")  # a line is no noise
             out[:, k] = np.interp(np.arange(len(out)), own, level)
         elif column.mean() > ALMOST_ALL or not white:
-            out[:, k], untold[k] = NO_NOISE * power[:, k].max(), white
-        if white and beyond_chance and not untold[k]:  # beside a vibration that is not shared it would be too much
-            most = unexplained * uniform_filter1d(power[:, k], settings.short_time_parts, mode="nearest")
-            out[column, k] = np.clip(most[column], NO_NOISE * power[:, k].max(), out[column, k])
-    return np.asarray(np.sqrt(np.maximum(out, 1e-300))), untold
+            out[:, k], unknown[k] = NO_NOISE * power[:, k].max(), white
+        if white and beyond_chance and not unknown[k]:  # beside a vibration that is not shared it would be too much
+            maximum = unexplained * uniform_filter1d(power[:, k], settings.short_time_parts, mode="nearest")
+            out[column, k] = np.clip(maximum[column], NO_NOISE * power[:, k].max(), out[column, k])
+    return np.asarray(np.sqrt(np.maximum(out, 1e-300))), unknown
 
 
 def _top_power(parts: Parts, settings: WienerSettings) -> Float64[np.ndarray, " k"]:

@@ -16,7 +16,7 @@ from imutool.array_types import Float64
 from imutool.cleaning.likelihood import CLEARLY
 from imutool.errors import DataError, LogError
 from imutool.inertial.aids import AUTO, BAROMETER, GROUND, STOPS, WHEELS, Aids
-from imutool.log_info.wheel_odometry import MOST_FACTOR, cover, find_wheels, rows_of_stretch, with_odometry
+from imutool.log_info.wheel_odometry import MAX_FACTOR, cover, find_wheels, rows_of_stretch, with_odometry
 from imutool.mcap_io.codec.schemas import PRESSURE
 from imutool.mcap_io.fields import numbers, numeric_fields, split
 from imutool.mcap_io.log import Log
@@ -83,8 +83,8 @@ def _with_height(found: Aids, log: Log, recording: Recording, signal: str) -> Ai
         raise DataError(f"{signal} has {len(t_ns)} values while the IMU measures", where=recording.name, expected="two or more")
     values_m, unit = _height_m(values[:, 0], signal, "pressure" in f"{topic}.{field}".lower())
     height = Scalars(t_ns, values_m[:, None], "m")
-    said = f"{unit}{_frozen(height)}{_beside_truth(height, recording, signal)}"
-    words = f"{signal} ({said}){cover(recording.imu, t_ns)}"
+    text = f"{unit}{_frozen(height)}{_beside_truth(height, recording, signal)}"
+    words = f"{signal} ({text}){cover(recording.imu, t_ns)}"
     return replace(found, signals=found.signals | {BAROMETER: words}, height=height)
 
 
@@ -118,11 +118,11 @@ def _beside_truth(height: Scalars, recording: Recording, signal: str) -> str:
     factor = float(each[best] @ true) / float(true @ true)
     if alike[best] < 0.0:
         raise DataError(f"{signal} falls where the true height rises", expected="a height or pressure of the air", fix=SIGN)
-    if not 1.0 / MOST_FACTOR < factor < MOST_FACTOR:
+    if not 1.0 / MAX_FACTOR < factor < MAX_FACTOR:
         raise DataError(f"{signal} changes by {factor:.3g} times the true height", expected="metres, or a pressure of the air")
     late_s = float(lags_s[best])
-    left = (1.0 - alike[best] ** 2) / max(1.0 - float(alike[len(lags_s) // 2]) ** 2, np.finfo(float).tiny)
-    if abs(late_s) < LATE_S or left > CLEARLY:
+    remaining = (1.0 - alike[best] ** 2) / max(1.0 - float(alike[len(lags_s) // 2]) ** 2, np.finfo(float).tiny)
+    if abs(late_s) < LATE_S or remaining > CLEARLY:
         return ""
     return f", {abs(late_s):.1f} s {'late' if late_s > 0 else 'early'} by the true height"
 
@@ -172,13 +172,13 @@ def _definition(log: Log, name: str) -> str:
 
 def _height_m(values: Float64[np.ndarray, " n"], signal: str, is_pressure: bool) -> tuple[Float64[np.ndarray, " n"], str]:
     """Height above the first value, and the unit of the values."""
-    least, most = float(values.min()), float(values.max())
+    minimum, maximum = float(values.min()), float(values.max())
     if not is_pressure:
-        if least < ALTITUDES_M[0] or most > ALTITUDES_M[1]:
-            raise DataError(f"{signal} is from {least:g} to {most:g}", expected="an altitude in m")
+        if minimum < ALTITUDES_M[0] or maximum > ALTITUDES_M[1]:
+            raise DataError(f"{signal} is from {minimum:g} to {maximum:g}", expected="an altitude in m")
         return values - values[0], "m"
     for unit, (low, high) in PRESSURE_UNITS.items():
-        if low <= least and most <= high:
+        if low <= minimum and maximum <= high:
             height = FACTOR_M * (1.0 - (values * (PRESSURE_UNITS["Pa"][0] / low) / SEA_PA) ** EXPONENT)
             return height - height[0], unit
-    raise DataError(f"{signal} is from {least:g} to {most:g}", expected="the air's pressure in Pa, hPa or kPa")
+    raise DataError(f"{signal} is from {minimum:g} to {maximum:g}", expected="the air's pressure in Pa, hPa or kPa")

@@ -1,6 +1,6 @@
 """Clock of a topic, from stamps that come in blocks.
 
-Up to `MOST_EXACT` steps are kept as they are. Of more only a histogram is, whose bins are 1/4096 of an octave wide: a median
+Up to `MAX_EXACT` steps are kept as they are. Of more only a histogram is, whose bins are 1/4096 of an octave wide: a median
 then errs by less than 0.02 %, and means by nothing.
 """
 
@@ -20,10 +20,10 @@ from imutool.recording.columns import clock_jumps, median
 from imutool.recording.sample_order import ticked
 
 UNUSUAL = 0.5  # share by which a period may differ from the median, to count for the rate
-MOST_BATCHED = 0.2  # share of short steps up to which stamps surely come one by one
-MOST_EXACT = 1 << 18  # steps: 2 MB, 22 minutes at 200 Hz
-MOST_HELD = 1 << 22  # steps of topics that are read in one pass: 32 MB
-LEAST_HELD = 128  # steps, whose memory a topic takes that has none
+MAX_BATCHED = 0.2  # share of short steps up to which stamps surely come one by one
+MAX_EXACT = 1 << 18  # steps: 2 MB, 22 minutes at 200 Hz
+MAX_HELD = 1 << 22  # steps of topics that are read in one pass: 32 MB
+MIN_HELD = 128  # steps, whose memory a topic takes that has none
 OCTAVE_BITS = 12
 FIRST, BINS = (1023 + 10) << OCTAVE_BITS, 30 << OCTAVE_BITS  # from 1 us to 18 minutes; beyond, all are in one bin
 EDGES = (FIRST + np.arange(BINS) << (52 - OCTAVE_BITS)).view(np.float64)
@@ -44,7 +44,7 @@ class Steps:
         self._parts.append(steps_ns)
         self._held, self.count = self._held + len(steps_ns), self.count + len(steps_ns)
         self.largest = max(self.largest, int(steps_ns.max(initial=0)))
-        if self._held > MOST_EXACT:
+        if self._held > MAX_EXACT:
             self._fold()
 
     def _fold(self) -> None:
@@ -176,7 +176,7 @@ class SensorStamps(IncreasingStamps):
     def sound(self) -> bool:
         """Whether the stamps increase, one by one, in nanoseconds: `stamp_line` finds no fault."""
         in_ns = self._fraction_ns * min(FRACTIONS) >= SECOND_NS
-        return self.increasing and in_ns and self._within <= MOST_BATCHED * self._near
+        return self.increasing and in_ns and self._within <= MAX_BATCHED * self._near
 
     @property
     def period_ns(self) -> float:
@@ -195,8 +195,8 @@ def clocks(stamps_of: StampsOf, counts: Mapping[str, int]) -> Iterator[tuple[int
     group, size = list[str](), 0
     for topic, count in counts.items():
         group.append(topic)
-        size += min(count, MOST_EXACT) + LEAST_HELD
-        if size > MOST_HELD:
+        size += min(count, MAX_EXACT) + MIN_HELD
+        if size > MAX_HELD:
             yield from _clocks(stamps_of, group)
             group, size = [], 0
     yield from _clocks(stamps_of, group)

@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 FIX_BY_HAND = BY_HAND[0].upper() + BY_HAND[1:]
 QUATERNIONS = "quaternions of poses"  # said only where they are misread
 START_LATE_S = 0.015  # half of what is a warning; a start from poses 10 ms late is off by about its standard deviation
-LEAST_VERTICAL = 0.85  # of gravity along the z of the poses, in the mean: 32 degrees
+MIN_VERTICAL = 0.85  # of gravity along the z of the poses, in the mean: 32 degrees
 NO_POSES = "the log has no true poses"
 NO_TURN = (
     "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or poses of another motion"
@@ -109,7 +109,7 @@ def lean_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
     """
     truth, vertical = whole.truth, whole.conventions.vertical_m_s2
     named = [warning for warning in _pose_warnings(found, whole) if not warning.endswith(BY_HAND)]
-    if truth is None or vertical is None or vertical > LEAST_VERTICAL * GRAVITY_M_S2 or named:
+    if truth is None or vertical is None or vertical > MIN_VERTICAL * GRAVITY_M_S2 or named:
         return []
     causes = "the IMU lies otherwise than their body, their world is not z up, or gravity was subtracted"
     return [
@@ -174,9 +174,9 @@ def _correction(warning: str, truth: Truth | None) -> str:
 
 def _apart(warning: str, truth: Truth | None) -> tuple[str, str]:
     """A warning without what to do, and that; empty where it says nothing to do."""
-    for fix, said in ((CORRECTION, _correction(warning, truth)), (BY_HAND, FIX_BY_HAND)):
+    for fix, text in ((CORRECTION, _correction(warning, truth)), (BY_HAND, FIX_BY_HAND)):
         if warning.endswith(fix):
-            return warning.removesuffix(f"; {fix}"), said
+            return warning.removesuffix(f"; {fix}"), text
     return warning, ""
 
 

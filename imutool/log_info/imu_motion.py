@@ -20,15 +20,15 @@ class ImuMotion:
         """`period_ns` is the median step between the samples."""
         self.motion = Motion()
         self.turns = {name: GyroTurns(known, period_ns) for name, known in poses.items() if known is not None}
-        self._least, self._most = np.full(6, np.inf), np.full(6, -np.inf)
+        self._minimum, self._maximum = np.full(6, np.inf), np.full(6, -np.inf)
 
     def see(self, samples: Samples) -> None:
         """Add the next samples, in order of time."""
         self.motion.see(samples)
         for turns in self.turns.values():
             turns.see(samples.stamp_ns, samples.values[:, :3])
-        self._least = np.minimum(self._least, samples.values.min(axis=0, initial=np.inf))
-        self._most = np.maximum(self._most, samples.values.max(axis=0, initial=-np.inf))
+        self._minimum = np.minimum(self._minimum, samples.values.min(axis=0, initial=np.inf))
+        self._maximum = np.maximum(self._maximum, samples.values.max(axis=0, initial=-np.inf))
 
     def summary(self, truth: Truth | None) -> TopicSummary:
         """Totals for the rules about conventions; nothing is converted."""
@@ -38,7 +38,8 @@ class ImuMotion:
         """Warnings of a gyro or an accelerometer that never changes: a measurement has noise."""
         count, why = self.motion.samples, "no sensor is behind it, or a simulation at rest without noise"
         axes = {"gyro": slice(3), "accel": slice(3, 6)} if count > 1 else {}
-        still = {name: self._least[s] + 0.0 for name, s in axes.items() if not (self._most - self._least)[s].any()}  # no -0.0
+        changes = self._maximum > self._minimum
+        still = {name: self._minimum[s] + 0.0 for name, s in axes.items() if not changes[s].any()}  # no -0.0
         return [f"{name} reads {value.tolist()} in {count} samples in a row: {why}" for name, value in still.items()]
 
 

@@ -32,7 +32,7 @@ from imutool.mcap_io.codec.reflection import LOG_TIME, Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, Topic
-from imutool.recording import LEAST_PERIOD_S
+from imutool.recording import MIN_PERIOD_S
 from imutool.recording.columns import jump_warnings
 from imutool.report import UNSET
 
@@ -248,7 +248,7 @@ def _imu_warnings(imu: ImuSamples) -> list[str]:
     warnings = [f"{n} sample{'s' * (n != 1)} {text}" for key, text in words.items() if (n := imu.counts[key])]
     warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in imu.stamps.faults]
     warnings += [*frame_words(imu.frames), *pause_words(imu.sound.long_ns), *jump_warnings(imu.jumps)]
-    if len(imu) > 1 and imu.period_s < LEAST_PERIOD_S and not imu.stamps.faults:
+    if len(imu) > 1 and imu.period_s < MIN_PERIOD_S and not imu.stamps.faults:
         warnings.append(f"{1.0 / imu.period_s:.3g} samples a second: the stamps are not in nanoseconds, or were never set")
     return warnings
 

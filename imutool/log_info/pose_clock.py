@@ -15,7 +15,7 @@ from imutool.mcap_io.log import Log
 FEWEST_TURNS, SEARCHED = 15, 1.0 / 6.0  # turns of a log, and share of it, in which another delay is searched
 LAG_S, ALIKE_S = 0.02, 0.03  # steps of the search; between delays of one setup
 APART = 1, 4  # poses of 0.1 s between which the body turns: over more, noise of the poses counts less
-LEAST_CORRELATION = 0.8  # under the best delay
+MIN_CORRELATION = 0.8  # under the best delay
 CLEAR = 5.0  # logarithm of a likelihood ratio, with a sample each second
 
 
@@ -29,26 +29,26 @@ def contradicts_delay(log: Log, imu_topic: str, pose_topic: str, late_s: float) 
         motion.see(samples)
     if truth is None or len(motion.table()[0]) < FEWEST_TURNS:
         return False
-    return any(_contradicts(motion, truth, late_s, apart) for apart in APART)
+    return any(_contradicts(motion, truth, late_s, spacing) for spacing in APART)
 
 
-def _contradicts(motion: Motion, truth: Truth, late_s: float, apart: int) -> bool:
+def _contradicts(motion: Motion, truth: Truth, late_s: float, spacing: int) -> bool:
     step, mean = motion.table()
     gyro = StepIntegral.of(step, mean[:, :3])
     longest_s = min(LONGEST_DELAY_S, SEARCHED * STEP_S * float(step[-1] - step[0]))
     lags, fits, spans_s = np.arange(-longest_s, longest_s + 1e-9, LAG_S), [], []
     for centre_s in (late_s, 0.0):
-        first, last, rate = turning(truth._replace(t_ns=truth.t_ns - round(1e9 * centre_s)), apart)
-        use, first_s, last_s = usable(first, last, motion.middle_ns, step, POSES_APART_NS + (apart - 1) * STEP_NS)
+        first, last, rate = turning(truth._replace(t_ns=truth.t_ns - round(1e9 * centre_s)), spacing)
+        use, first_s, last_s = usable(first, last, motion.middle_ns, step, POSES_APART_NS + (spacing - 1) * STEP_NS)
         inside = (first_s > longest_s + STEP_S * step[0]) & (last_s + longest_s < STEP_S * (step[-1] + 1))
         fits.append(np.zeros(len(lags)))
         if inside.sum() >= FEWEST_TURNS:
             means = (gyro.between(first_s[inside] - lag, last_s[inside] - lag) for lag in lags)
             fits[-1] = np.array([_aligned(rate[use[inside]], measured) for measured in means])
             spans_s.append(float(last_s[inside][-1] - first_s[inside][0]))
-    here, best = float(fits[0][np.abs(lags) <= ALIKE_S].max()), float(np.max(fits))
-    ratio = np.log((1.0 - min(here, best) ** 2) / max(1.0 - best**2, 1e-9))
-    return best > LEAST_CORRELATION and bool(0.5 * max(spans_s) * ratio > CLEAR)
+    fit_near_zero, best = float(fits[0][np.abs(lags) <= ALIKE_S].max()), float(np.max(fits))
+    ratio = np.log((1.0 - min(fit_near_zero, best) ** 2) / max(1.0 - best**2, 1e-9))
+    return best > MIN_CORRELATION and bool(0.5 * max(spans_s) * ratio > CLEAR)
 
 
 def _aligned(a: Float64[np.ndarray, "n 3"], b: Float64[np.ndarray, "n 3"]) -> float:

@@ -21,17 +21,17 @@ from imutool.recording.columns import median, quantile
 
 logger = logging.getLogger(__name__)
 
-LEAST_TURNS = 20  # between poses
-LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
-LEAST_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be reported
+MIN_TURNS = 20  # between poses
+MIN_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
+MIN_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be reported
 LESS_TURNED = 1.0 / 3.0  # at most, of what the poses leave of the gyro's motion as recorded, remains with a turned body
 UNLIKE_RAD_S = 0.1  # rms that poses leave of the gyro's motion; EuRoC, TUM-VI and FETCH explain at least 91 %
 JUMP_DEG, JUMP_MEDIANS, JUMP_SHARE = 5.0, 10.0, 0.2  # misfit of a turn in 0.1 s; by the usual misfit; of the gyro's turn
-LEAST_JUMPS_DEG = 15.0  # their sum, below which one is no news
-MOST_JUMPS, REFITS = 0.1, 4  # share of the turns up to which jumps are left out, and fits that find them
+MIN_JUMPS_DEG = 15.0  # their sum, below which one is no news
+MAX_JUMPS, REFITS = 0.1, 4  # share of the turns up to which jumps are left out, and fits that find them
 UNSURE_SHARE, UNSURE_DEG = 0.1, (1.0, 3.0)  # of a rotation, within these: its standard deviation, if it is not reported
 SPARSE_S, FEWEST_BETWEEN = 0.15, 8  # period of poses, from which on they may be too far apart, and poses that show it
-MOST_BETWEEN_DEG, OFTEN = 1.0, 0.9  # error of turns between poses, and share of them that have less
+MAX_BETWEEN_DEG, OFTEN = 1.0, 0.9  # error of turns between poses, and share of them that have less
 TURNED_DEG = 4.0  # more than a mount that was meant to be straight; EuRoC, TUM-VI and BROAD have up to 1.5
 CORRECTION = "imutool convert LOG OUT --fix corrects it"
 BY_HAND = "turn the axes of the IMU or those of the poses to one body, or record turns about two axes for --fix"
@@ -94,7 +94,7 @@ class GyroTurns:
         second without a gap of the IMU. A few jumps of the poses are counted, and left out of all other figures.
         """
         poses = self._poses
-        if self._samples < LEAST_TURNS or len(poses.t_ns) < LEAST_TURNS:
+        if self._samples < MIN_TURNS or len(poses.t_ns) < MIN_TURNS:
             return None
         start_ns, end_ns, rate = turning(poses)
         steps = (end_ns - start_ns).astype(float)
@@ -102,7 +102,7 @@ class GyroTurns:
         inside &= np.isfinite(rate).all(axis=1)
         gaps = np.concatenate(self._gaps)
         inside &= np.searchsorted(gaps[:, 0], end_ns) <= np.searchsorted(gaps[:, 1], start_ns, side="right")
-        if inside.sum() < LEAST_TURNS:
+        if inside.sum() < MIN_TURNS:
             return None
         begin, end = (seconds(t_ns[inside], self._first_ns) for t_ns in (start_ns, end_ns))
         mean = (self._turned[1:] - self._turned[:-1])[inside] / (end - begin)[:, None]
@@ -111,7 +111,7 @@ class GyroTurns:
 
 def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     """Agreement of poses with samples in memory, as `GyroTurns.agreement`."""
-    if len(imu) < LEAST_TURNS:
+    if len(imu) < MIN_TURNS:
         return None
     turns = GyroTurns(poses, float(median(np.diff(imu.t_ns))))
     for first in range(0, len(imu), BLOCK):
@@ -134,17 +134,17 @@ def _agreement(
         off_deg = np.degrees(misfit * length_s)
         clear = JUMP_SHARE * np.linalg.norm(gyro, axis=1) < misfit  # else a scale or a clock may be off
         jumped = clear & (off_deg > max(JUMP_DEG, JUMP_MEDIANS * median(off_deg)))
-        jumps = off_deg[jumped] if off_deg[jumped].sum() > LEAST_JUMPS_DEG else np.zeros(0)
-        if not len(jumps) or len(jumps) > MOST_JUMPS * len(kept):
+        jumps = off_deg[jumped] if off_deg[jumped].sum() > MIN_JUMPS_DEG else np.zeros(0)
+        if not len(jumps) or len(jumps) > MAX_JUMPS * len(kept):
             break
         kept = ~jumped
     motion = float(np.sqrt((gyro[kept] ** 2).sum(axis=1).mean()))
-    if motion < LEAST_RATE_RAD_S:
+    if motion < MIN_RATE_RAD_S:
         return None
     rms = float(np.sqrt((misfit[kept] ** 2).mean()))
     explained = max(0.0, 1.0 - (rms / motion) ** 2)
     as_recorded = 1.0 - float(((gyro - omega)[kept] ** 2).sum(axis=1).mean()) / motion**2
-    seen = explained > LEAST_EXPLAINED
+    seen = explained > MIN_EXPLAINED
     body = rotation_deg(turn, gyro[kept], omega[kept], float(end[-1] - begin[0])) if seen else None
     if body is not None and body.std_deg.max() >= np.clip(UNSURE_SHARE * np.linalg.norm(body.deg), *UNSURE_DEG):
         body = None
@@ -154,14 +154,14 @@ def _agreement(
 def turned_somehow(explained: float, as_recorded: float) -> bool:
     """Whether poses explain the gyro's motion with their body turned, and none without."""
     less = 1.0 - explained < LESS_TURNED * (1.0 - as_recorded)
-    return explained > LEAST_EXPLAINED and as_recorded < 0.0 and less
+    return explained > MIN_EXPLAINED and as_recorded < 0.0 and less
 
 
 def body_warnings(topic: str, turned_deg: Sequence[float], explained: float, as_recorded: float) -> list[str]:
     """Warning of poses whose body is turned far, also where the motion does not show how."""
     if not len(turned_deg) and turned_somehow(explained, as_recorded):
-        said = f"the poses {topic} turn as the gyro does only with their body turned, and the motion does not show how"
-        return [f"{said}: turns about one axis, as of a vehicle; {BY_HAND}"]
+        text = f"the poses {topic} turn as the gyro does only with their body turned, and the motion does not show how"
+        return [f"{text}: turns about one axis, as of a vehicle; {BY_HAND}"]
     deg = float(np.linalg.norm(turned_deg))
     return (
         [f"the body of the poses {topic} is turned by {deg:.0f}° against the gyro; {CORRECTION}"] if _is_far(turned_deg) else []
@@ -174,7 +174,7 @@ def _is_far(turned_deg: Sequence[float] | Float64[np.ndarray, " 3"]) -> bool:
 
 def unlike(explained: float, rms_rad_s: float) -> bool:
     """Whether poses leave most of the gyro's motion unexplained."""
-    return explained <= LEAST_EXPLAINED and rms_rad_s >= UNLIKE_RAD_S
+    return explained <= MIN_EXPLAINED and rms_rad_s >= UNLIKE_RAD_S
 
 
 def motion_warnings(topic: str, explained: float, rms_rad_s: float, jumps: int, largest_deg: float) -> list[str]:
@@ -188,8 +188,8 @@ def motion_warnings(topic: str, explained: float, rms_rad_s: float, jumps: int, 
     if not jumps:
         return []
     often = "once" if jumps == 1 else f"{jumps} times"
-    said = f"the poses {topic} turn by up to {largest_deg:.0f}° in 0.1 s that the gyro does not show, {often}"
-    return [f"{said}: markers that were exchanged or hidden, a gyro at the end of its range, or clocks that differ"]
+    text = f"the poses {topic} turn by up to {largest_deg:.0f}° in 0.1 s that the gyro does not show, {often}"
+    return [f"{text}: markers that were exchanged or hidden, a gyro at the end of its range, or clocks that differ"]
 
 
 def sparse_warnings(poses: Truth) -> list[str]:
@@ -205,7 +205,7 @@ def sparse_warnings(poses: Truth) -> list[str]:
     q, share = quaternion.unit(poses.q_wb_wxyz), (t_s[middle] - t_s[middle - 1]) / (t_s[middle + 1] - t_s[middle - 1])
     between = quaternion.slerp(q[middle - 1], q[middle + 1], share)
     missed_deg = float(np.degrees(quantile(quaternion.angle_between(between, q[middle]), OFTEN))) / 4.0
-    if missed_deg < MOST_BETWEEN_DEG:
+    if missed_deg < MAX_BETWEEN_DEG:
         return []
     what = (
         f"the poses {poses.topic} are {period_s:.2g} s apart, and interpolation between them is off by up to {missed_deg:.1f}°"
@@ -270,10 +270,10 @@ def _frames_alike(log: Log, topic: str, same: Callable[..., bool]) -> frozenset[
         return frozenset()
     for named in log.with_schema((schemas.TF,)):
         for batch in log.pose_batches(named.name):
-            _, mine, theirs = np.intersect1d(poses.t_ns, batch.stamp_ns, return_indices=True)
-            own = np.hstack([poses.p_wb, poses.q_wb_wxyz])[mine]
-            frame = np.hstack([batch.p_wb, batch.q_wb_wxyz])[theirs]
-            (alike if len(mine) and same(own, frame) else other).add(batch.child_frame_id)
+            _, pose_rows, imu_rows = np.intersect1d(poses.t_ns, batch.stamp_ns, return_indices=True)
+            own = np.hstack([poses.p_wb, poses.q_wb_wxyz])[pose_rows]
+            frame = np.hstack([batch.p_wb, batch.q_wb_wxyz])[imu_rows]
+            (alike if len(pose_rows) and same(own, frame) else other).add(batch.child_frame_id)
     return frozenset(alike - other)
 
 

@@ -16,7 +16,7 @@ def in_si_units(recording: Recording) -> tuple[Recording, list[str]]:
     imu = recording.imu
     whole = replace(convention_summary(imu, truth_of(recording)), settings=CleaningSettings())
     found = [finding for finding in Units().findings(whole) if finding.severity != "note"]
-    said = [finding.what + (", converted" if finding.action == "converted" else "") for finding in found]
+    texts = [finding.what + (", converted" if finding.action == "converted" else "") for finding in found]
     if (whole.scale == 1.0).all():
-        return recording, said
-    return replace(recording, imu=Imu(imu.t_ns, imu.gyro * whole.scale[:3], imu.accel * whole.scale[3:])), said
+        return recording, texts
+    return replace(recording, imu=Imu(imu.t_ns, imu.gyro * whole.scale[:3], imu.accel * whole.scale[3:])), texts

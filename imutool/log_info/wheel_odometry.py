@@ -39,14 +39,14 @@ from imutool.recording.columns import ClockRun, median, quantile
 from imutool.recording.message_log import named_kind
 
 BLOCK_NS = 500_000_000  # over which the accelerations of odometry and IMU are compared
-MOST_MOUNT_STD_RAD = 0.2  # of a mount that the motion shows
-MOST_SLIP_M_S2 = 2.0  # difference in size of the two: above, wheels slip or their odometry was reset
-LEAST_NOISE_M_S2 = 0.05  # of such a difference: what does not accelerate shows nothing, however exact it is
+MAX_MOUNT_STD_RAD = 0.2  # of a mount that the motion shows
+MAX_SLIP_M_S2 = 2.0  # difference in size of the two: above, wheels slip or their odometry was reset
+MIN_NOISE_M_S2 = 0.05  # of such a difference: what does not accelerate shows nothing, however exact it is
 FEWEST, JUMPS = 4, 10.0  # half seconds; times the usual acceleration, above which odometry was reset
 LEVEL = 0.98  # cosine of a vehicle's tilt
-MOST_FACTOR = 1.5  # between the accelerations of odometry and IMU: more than a wheel's wrong radius
-MOST_OF_TIME = 0.95  # that an aid covers; less is said
-SAME_M, LEAST_PATH_M = 1e-3, 1.0  # odometry as near to the truth, over such a path, is the truth
+MAX_FACTOR = 1.5  # between the accelerations of odometry and IMU: more than a wheel's wrong radius
+MAX_OF_TIME = 0.95  # that an aid covers; less is said
+SAME_M, MIN_PATH_M = 1e-3, 1.0  # odometry as near to the truth, over such a path, is the truth
 RIGHT = "odometry in m/s and rad/s, of the vehicle that carries the IMU"
 NO_MOUNT = "the motion does not show how the IMU is mounted in the frame of {}"
 COMMAND = re.compile(r"cmd|command|setpoint|target|desired")
@@ -82,7 +82,7 @@ def with_odometry(found: Aids, log: Log, recording: Recording, name: str) -> Aid
 def cover(imu: Imu, t_ns: Int64[np.ndarray, " n"]) -> str:
     """Words on an aid that measures for a part of the time alone."""
     share = coverage("", "", t_ns, [imu.t_ns]).coverage
-    return f", {share:.0%} of the time" if isinstance(share, float) and share < MOST_OF_TIME else ""
+    return f", {share:.0%} of the time" if isinstance(share, float) and share < MAX_OF_TIME else ""
 
 
 def _on_clock(poses: Poses, imu: Imu, name: str) -> tuple[Poses, float]:
@@ -157,7 +157,7 @@ def _same_path(poses: Poses, truth: Poses) -> bool:
     true, valid = truth.at(poses.t_ns)
     p, p_true = poses.p_wb[valid], true.p_wb[valid]
     motion = align(p, p_true) if len(p) > 2 else None
-    if motion is None or float(quaternion.length(np.diff(p, axis=0)).sum()) < LEAST_PATH_M:
+    if motion is None or float(quaternion.length(np.diff(p, axis=0)).sum()) < MIN_PATH_M:
         return False
     R, shift = motion
     return float(np.sqrt(((p @ R.T + shift - p_true) ** 2).sum(axis=1).mean())) < SAME_M
@@ -226,11 +226,11 @@ def _check_motion(each: _Blocks, name: str) -> None:
     z_b, z_v = (x[:, 0] + 1j * x[:, 1] - (x[:, 0] + 1j * x[:, 1]).mean() for x in (force, a))
     both, of_b, of_v = abs(np.vdot(z_v, z_b)), np.vdot(z_b, z_b).real, np.vdot(z_v, z_v).real
     share = both**2 / max(of_b * of_v, np.finfo(float).tiny)
-    if 1.0 - share > 2.0 * use.sum() * share * MOST_MOUNT_STD_RAD**2:  # of the angle of z
+    if 1.0 - share > 2.0 * use.sum() * share * MAX_MOUNT_STD_RAD**2:  # of the angle of z
         raise DataError(
             NO_MOUNT.format(name), expected="a vehicle that brakes and starts again, with velocities in its own frame"
         )
-    if of_b / both < 1.0 / MOST_FACTOR or both / of_v > MOST_FACTOR:
+    if of_b / both < 1.0 / MAX_FACTOR or both / of_v > MAX_FACTOR:
         factor = np.sqrt(of_v / of_b)
         raise DataError(f"{name} accelerates {factor:.2g} times as much as the IMU", expected=RIGHT, fix="Check its unit")
 
@@ -244,7 +244,7 @@ def _mounted(poses: Poses, imu: Imu, name: str) -> Odometry:
     every = _blocks(poses, imu)
     _check_motion(every, name)
     f_v, f_b = every.a_v - GRAVITY_W[2] * every.up_v, every.f_b
-    alike = np.abs(quaternion.length(f_v) - quaternion.length(f_b)) < MOST_SLIP_M_S2
+    alike = np.abs(quaternion.length(f_v) - quaternion.length(f_b)) < MAX_SLIP_M_S2
     f_v, f_b = f_v[alike], f_b[alike]
     if len(f_v) < 3:
         raise DataError(
@@ -252,9 +252,9 @@ def _mounted(poses: Poses, imu: Imu, name: str) -> Odometry:
         )
     u, _, vt = np.linalg.svd(f_v.T @ f_b)
     R_vb = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
-    variance = max(float(((f_v - f_b @ R_vb.T) ** 2).sum()) / (3 * len(f_v) - 3), LEAST_NOISE_M_S2**2)
+    variance = max(float(((f_v - f_b @ R_vb.T) ** 2).sum()) / (3 * len(f_v) - 3), MIN_NOISE_M_S2**2)
     information = np.linalg.eigvalsh(-(hat(f_v) @ hat(f_v)).sum(axis=0)).min()
     std = float(np.sqrt(variance / max(information, np.finfo(float).tiny)))
-    if std > MOST_MOUNT_STD_RAD:
+    if std > MAX_MOUNT_STD_RAD:
         raise DataError(NO_MOUNT.format(name), expected="a vehicle that brakes and starts again")
     return Odometry(poses, R_vb, std)

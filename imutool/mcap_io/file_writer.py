@@ -237,8 +237,8 @@ class LogWriter:
         """Writes the message indexes of the chunk just written, and enters it in the summary."""
         first, counts = self.target.position, dict[int, int]()
         for channel in (ids := np.flatnonzero(np.bincount(channels)).tolist() if len(channels) > 1 else channels.tolist()):
-            mine = channels == channel if len(ids) > 1 else slice(None)
-            index = messages.message_index(channel, times[mine], offsets[mine])
+            of_channel = channels == channel if len(ids) > 1 else slice(None)
+            index = messages.message_index(channel, times[of_channel], offsets[of_channel])
             counts[channel] = (len(index) - messages.SINGLE_INDEX.size) // 16 + 1
             entry.message_index_offsets[channel] = self.target.position
             self.target.write(index)

@@ -216,9 +216,9 @@ class _Columns:
         parts = self.kept.pop(name, []) if self.run.alone else self.kept.get(name, [])  # of one stretch nothing is asked twice
         if not parts:
             return np.zeros(0, np.int64), [np.zeros((0, width)) for width in widths]
-        apart = [list(column) for column in zip(*parts, strict=True)]
+        columns_of_parts = [list(column) for column in zip(*parts, strict=True)]
         del parts  # so that no topic is in memory twice
-        stamp_ns, sequence, *columns = (joined_column(apart.pop(0)) for _ in range(len(apart)))
+        stamp_ns, sequence, *columns = (joined_column(columns_of_parts.pop(0)) for _ in range(len(columns_of_parts)))
         for column in (stamp_ns, *columns) if self.run.alone else ():  # so that a recording needs no copy
             column.flags.writeable = False
         rows = self.run.rows if name == self.imu_topic else self.run.rows_of(stamp_ns)

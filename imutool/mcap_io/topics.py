@@ -37,7 +37,7 @@ PART_KEY = "imutool_part_of"  # channel metadata: one sensor of the IMU on that 
 RECORDED_KEY = "imutool_recorded_as"  # channel metadata: the original of the IMU on that topic
 KIND_KEY = "imutool_kind"  # channel metadata of poses: truth, estimate, odometry or unknown
 VELOCITY_KEY = "imutool_velocity_of"  # channel metadata: the world velocity of the poses on this topic
-CUT, MOST_REPEATED = "Cut the log before or after it", 0.2  # share of stamps that repeat; more come in batches
+CUT, MAX_REPEATED = "Cut the log before or after it", 0.2  # share of stamps that repeat; more come in batches
 UNIT_KEY = "unit"  # channel metadata of a scalar
 MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM, schemas.POSE_COVARIANCE)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
@@ -192,7 +192,7 @@ class StampCheck:
         if bad.any():
             row = int(np.argmax(bad))
             how, same = "repeats" if stamp_ns[row] == before[row] else "goes back", (stamp_ns == before).mean()
-            fix = f"{RESTAMP} spreads samples that share a stamp" if self.fix and same > MOST_REPEATED else self.fix
+            fix = f"{RESTAMP} spreads samples that share a stamp" if self.fix and same > MAX_REPEATED else self.fix
             what = f"message {self.count + row} (sequence {sequence[row]}) has the stamp {stamp_ns[row]} ns, which {how}: "
             what = f"{what}the message before has {before[row]} ns"
             raise LogError(what, expected="stamps that increase", fix=fix if stamp_ns[row] else UNSET_FIX)

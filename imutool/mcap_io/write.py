@@ -149,11 +149,11 @@ def chunks(group: Sequence[Series]) -> Iterator[Chunk]:
         offsets = starts[first:last] - starts[first]
         data = np.empty(int(ends[last - 1] - starts[first]), np.uint8)
         for index, series in enumerate(group):
-            mine = offsets[which[first:last] == index]
-            if len(mine):
-                rows = series.records(slice(done[index], done[index] + len(mine)))
-                messages.scatter(data, mine, rows)
-                done[index] += len(mine)
+            own_bytes = offsets[which[first:last] == index]
+            if len(own_bytes):
+                rows = series.records(slice(done[index], done[index] + len(own_bytes)))
+                messages.scatter(data, own_bytes, rows)
+                done[index] += len(own_bytes)
         channels = np.array([series.channel for series in group], np.uint16)[which[first:last]]
         yield Chunk(data.tobytes(), channels, times[first:last], offsets)
 

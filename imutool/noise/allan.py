@@ -33,13 +33,13 @@ MISFIT = 3.5  # standard deviations at one averaging time that the sum may miss 
 NEEDED = 12.0  # rise of chi² when a power is taken out, below which it was not needed
 TOLD_APART = 4.0  # rise of chi² when a power makes way for its neighbour, below which it could be either
 CORRELATED = 1.7  # standard deviations of slopes beyond the white one: neighbouring averaging times share their samples
-LEAST_FREEDOM = 10.0  # degrees of freedom that an averaging time needs to bound a density from above
+MIN_FREEDOM = 10.0  # degrees of freedom that an averaging time needs to bound a density from above
 BOUND_RISK = 0.002  # probability that one averaging time puts the bound too low
 HUBER = 2.0
 COARSE = 0.55  # steps of the readings: as much as two neighbouring readings scatter, whatever the noise below them
 HALF = 0.5
-LEAST_TIMES = 3  # averaging times, an octave apart, that anything is fitted to
-LEAST_TIMES_OF = {"quantisation": 1, "density": 3, "instability": 3, "walk": 2, "ramp": 2}  # over which it must be the half
+MIN_TIMES = 3  # averaging times, an octave apart, that anything is fitted to
+MIN_TIMES_OF = {"quantisation": 1, "density": 3, "instability": 3, "walk": 2, "ramp": 2}  # over which it must be the half
 ITERATIONS = 8
 FLICKER = 2.0 * np.log(2.0) / np.pi
 
@@ -148,7 +148,7 @@ def density_bound(curve: Curve) -> list[float | None]:
     """
     from scipy.special import gammaincinv
 
-    enough = curve.freedom >= LEAST_FREEDOM
+    enough = curve.freedom >= MIN_FREEDOM
     if not enough.any():
         return [None] * 3
     freedom = curve.freedom[enough]
@@ -168,7 +168,7 @@ def _slopes(
     if not (variance > 0).all():
         return Slopes()  # a constant: no sensor, or one that is stuck
     error = np.sqrt(2.0 / freedom + MODEL_ERROR**2)
-    for first in range(len(tau_s) - LEAST_TIMES + 1):
+    for first in range(len(tau_s) - MIN_TIMES + 1):
         part = slice(first, None)
         fit = _fit(tau_s[part], variance[part], error[part])
         if fit.misfit <= MISFIT:
@@ -196,11 +196,11 @@ def _fit(tau_s: Float64[np.ndarray, " m"], variance: Float64[np.ndarray, " m"], 
     best = _non_negative(names, tau_s, variance, error)
     while len(names) > 1:
         without = {name: _non_negative([n for n in names if n != name], tau_s, variance, error) for name in names}
-        least = min(without, key=lambda name: without[name][1])
-        if without[least][1] - best[1] >= NEEDED:
+        minimum = min(without, key=lambda name: without[name][1])
+        if without[minimum][1] - best[1] >= NEEDED:
             break
-        names.remove(least)
-        best = without[least]
+        names.remove(minimum)
+        best = without[minimum]
     coefficients, chi2, residual, std = best
     powers, spread, doubtful = {}, {}, set()
     order = list(POWERS)
@@ -257,7 +257,7 @@ def part(name: str, value: float, tau_s: Float64[np.ndarray, " m"]) -> Float64[n
 def _is_seen(name: str, powers: dict[str, float], tau_s: Float64[np.ndarray, " m"]) -> bool:
     """Whether a power makes up half of the variance over as many averaging times as its slope needs to show."""
     rules: Bool[np.ndarray, " m"] = part(name, powers[name], tau_s) ** 2 >= HALF * _sum(powers, tau_s)
-    return int(rules.sum()) >= LEAST_TIMES_OF[name]
+    return int(rules.sum()) >= MIN_TIMES_OF[name]
 
 
 VIBRATES = 2.0  # times the white variance at shorter averaging times: more than any filter or misfit

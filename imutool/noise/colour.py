@@ -16,12 +16,12 @@ SAME_RATE = 0.01  # by which two rates may differ and be one
 WINDOW_S = 1.0  # in which the noise has one size
 EDGES_HZ = (0.0, 1.5, 2.5, 4.5, 7.5, 10.5, 14.5, 20.5, 28.5, 40.5, 56.5, 75.5, 105.0, 150.0, 210.0, 300.0, 420.0)
 FACTORS = 6  # by which bands and axes grow and shrink together
-LEAST_WINDOWS = 20  # of a spectrum that follows the motion
-LEAST_SHARE = 0.05  # of the power of what is left that is noise, where the expected signal has noise of its own
+MIN_WINDOWS = 20  # of a spectrum that follows the motion
+MIN_SHARE = 0.05  # of the power of what is left that is noise, where the expected signal has noise of its own
 NOTICEABLE = 0.1  # of the expected power: less says nothing of the expected signal's own noise
 CORRELATED = 1.5  # neighbouring lines of a Hann window's spectrum count as so many fewer
 WHOLE = 1.02  # times its samples' periods that a window without a gap lasts at most
-LEAST_MOTION = 1e-9  # rms rate of change
+MIN_MOTION = 1e-9  # rms rate of change
 RANGE = (0.025, 0.975)  # quantiles of the size of windows
 DIGITS = 4  # of a number in a file
 
@@ -41,7 +41,7 @@ class Colour(Settings, frozen=True, kw_only=True):
         mean + follows_gyro (m_g - motion[0]) + follows_accel (m_a - motion[1]) + sum_j factors_j z_j + own z
 
     with the z standard normal numbers, and m the logarithm of the rms rate of change that the reading without noise has in
-    the window (rad/s², m/s³), cut to `least` and `most`. Within a band `shape` says how the power goes on from line to line,
+    the window (rad/s², m/s³), cut to `minimum` and `maximum`. Within a band `shape` has the power of one line after the other,
     1 / window_s apart. `gyro_range` and `accel_range` are the quantiles 2.5 and 97.5 % of the size in a window.
     """
 
@@ -55,8 +55,8 @@ class Colour(Settings, frozen=True, kw_only=True):
     factors: tuple[Levels, ...]
     own: Levels
     motion: tuple[float, float]
-    least: tuple[float, float]
-    most: tuple[float, float]
+    minimum: tuple[float, float]
+    maximum: tuple[float, float]
     gyro_range: Sizes
     accel_range: Sizes
 
@@ -98,7 +98,7 @@ class Colour(Settings, frozen=True, kw_only=True):
         total = np.concatenate([np.zeros((1, 2)), np.cumsum(squares, axis=0)])
         begins, ends = (np.clip(rows, 0, len(squares)) for rows in (firsts, firsts + count - 1))
         size = np.sqrt(np.maximum(total[ends] - total[begins], 0.0) / np.maximum(ends - begins, 1)[:, None])
-        return np.asarray(np.clip(np.log(np.maximum(size, LEAST_MOTION)), self.least, self.most) - self.motion)
+        return np.asarray(np.clip(np.log(np.maximum(size, MIN_MOTION)), self.minimum, self.maximum) - self.motion)
 
 
 def measured(
@@ -113,28 +113,28 @@ def measured(
     """
     count = _count(WINDOW_S, rate_hz)
     windows = [window for part in parts for window in _windows(*part, count, rate_hz)]
-    if len(windows) < LEAST_WINDOWS:
+    if len(windows) < MIN_WINDOWS:
         return None
     recorded, expected = (np.array(samples) for samples in zip(*windows, strict=True))
-    real, ideal, left = (_power(x / std) for x in (recorded, expected, recorded - expected))
+    real, ideal, rest = (_power(x / std) for x in (recorded, expected, recorded - expected))
     edges_hz = (*(edge for edge in EDGES_HZ if edge < 0.45 * rate_hz), 0.5 * rate_hz)
     band = _bands(edges_hz, count, rate_hz)
     lines = np.bincount(band)
     in_bands = [
-        np.stack([power[..., band == k].mean(axis=-1) for k in range(len(lines))], axis=-1) for power in (real, ideal, left)
+        np.stack([power[..., band == k].mean(axis=-1) for k in range(len(lines))], axis=-1) for power in (real, ideal, rest)
     ]
     of_real, of_ideal, of_left = (power.sum(axis=0) for power in in_bands)
-    share = np.clip((of_real - of_ideal) / of_left, LEAST_SHARE, 1.0)
+    share = np.clip((of_real - of_ideal) / of_left, MIN_SHARE, 1.0)
     log_power = np.log(in_bands[2] * np.where(of_left > NOTICEABLE * of_ideal, share, 1.0))
     freedom = np.maximum(lines / CORRELATED, 0.5 * CORRELATED)
     log_power += np.log(freedom) - digamma(freedom)  # a mean of few lines is drawn low (Bartlett and Kendall 1946)
-    motion = np.log(np.maximum(_rate_of_change(expected, rate_hz), LEAST_MOTION))
+    motion = np.log(np.maximum(_rate_of_change(expected, rate_hz), MIN_MOTION))
     columns = np.column_stack([np.ones(len(motion)), motion - motion.mean(axis=0)])
     rows = log_power.reshape(len(log_power), -1)
     coefficients = np.linalg.lstsq(columns, rows, rcond=None)[0]
     factors, own = _spread(rows - columns @ coefficients, np.tile(polygamma(1, freedom), 6))
-    fine = np.log(left.mean(axis=0))
-    shape = fine - np.log(np.stack([left.mean(axis=0)[:, band == k].mean(axis=1) for k in range(len(lines))], axis=1))[:, band]
+    fine = np.log(rest.mean(axis=0))
+    shape = fine - np.log(np.stack([rest.mean(axis=0)[:, band == k].mean(axis=1) for k in range(len(lines))], axis=1))[:, band]
     shares = ((recorded - expected) / std).reshape(len(recorded), -1, 2, 3).var(axis=1).mean(axis=2)
     low, high = np.quantile(np.sqrt(shares / shares.mean(axis=0)), RANGE, axis=0)
     return Colour(
@@ -148,18 +148,18 @@ def measured(
         factors=tuple(_levels(row) for row in factors),
         own=_levels(own),
         motion=_two(motion.mean(axis=0)),
-        least=_two(motion.min(axis=0)),
-        most=_two(motion.max(axis=0)),
+        minimum=_two(motion.min(axis=0)),
+        maximum=_two(motion.max(axis=0)),
         gyro_range=(_rounded(low[0]), _rounded(high[0])),
         accel_range=(_rounded(low[1]), _rounded(high[1])),
     )
 
 
 def _spread(
-    left: Float64[np.ndarray, "w k"], sampling: Float64[np.ndarray, " k"]
+    rest: Float64[np.ndarray, "w k"], sampling: Float64[np.ndarray, " k"]
 ) -> tuple[Float64[np.ndarray, "f k"], Float64[np.ndarray, " k"]]:
     """Principal factors of the levels, and the spread that each has alone, without that of a finite window."""
-    covariance = np.cov(left.T)
+    covariance = np.cov(rest.T)
     variance = np.diag(covariance)
     known = covariance - np.diag(np.minimum(sampling, variance))
     values, vectors = np.linalg.eigh(known)

@@ -25,8 +25,8 @@ from imutool.recording import Imu, Poses, seconds
 MAD = 1.4826  # of a normal distribution: its standard deviation over its median size
 MAD_EFFICIENCY = 0.37
 OVERLAP = 2  # windows begin twice in their own length
-LEAST_WINDOWS = 9
-MOST_WINDOWS = 3000  # of one length, in runs of neighbours: the median is good to 2 per cent with as many
+MIN_WINDOWS = 9
+MAX_WINDOWS = 3000  # of one length, in runs of neighbours: the median is good to 2 per cent with as many
 RUN = 60
 TURNED = 1.0 / 3.0  # of T, the least singular value of G: a window that turns all the way round shows no constant
 MAX_SAMPLES = 50_000  # at once
@@ -72,7 +72,7 @@ def curves(imu: Imu, truth: Poses) -> tuple[Curve, Curve]:
         n *= 2
     if not lengths:
         raise DataError(
-            "the truth covers no stretch without gaps", expected=f"at least {LEAST_WINDOWS} windows of {start * period_s:.3g} s"
+            "the truth covers no stretch without gaps", expected=f"at least {MIN_WINDOWS} windows of {start * period_s:.3g} s"
         )
     tau_s, degrees = np.array(lengths), np.array(worth)
     return Curve(tau_s, np.array(found[0]), degrees), Curve(tau_s, np.array(found[1]), degrees)
@@ -81,8 +81,8 @@ def curves(imu: Imu, truth: Poses) -> tuple[Curve, Curve]:
 def _starts(count: int, n: int, hop: int, broken: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
     """First samples of windows of n steps that touch no gap; of more than enough, runs of neighbours all over the log."""
     first = np.arange(0, max(count - n, 0), hop)
-    if len(first) > MOST_WINDOWS:
-        runs = MOST_WINDOWS // RUN
+    if len(first) > MAX_WINDOWS:
+        runs = MAX_WINDOWS // RUN
         begin = np.linspace(0, len(first) - RUN, runs).astype(int)
         first = first[np.unique((begin[:, None] + np.arange(RUN)).ravel())]
     kept: Int64[np.ndarray, " m"] = first[broken[first + n] == broken[first]]
@@ -99,7 +99,7 @@ def _spread(
     sensor: str,
 ) -> Float64[np.ndarray, "3"] | None:
     """Allan deviation of one sensor's error at one window length; None where too few windows can show it."""
-    if len(first) <= LEAST_WINDOWS:  # too few pairs of neighbours, and the longest windows take the most memory
+    if len(first) <= MIN_WINDOWS:  # too few pairs of neighbours, and the longest windows take the most memory
         return None
     at_once = max(1, MAX_SAMPLES // n)
     parts = [_error(imu, t, R_wb, v_w, first[k : k + at_once], n, sensor) for k in range(0, len(first), at_once)]
@@ -107,7 +107,7 @@ def _spread(
     first, y = first[shown], y[shown]
     after = np.searchsorted(first, first + n)  # the window that begins where this one ends
     pairs = np.flatnonzero((after < len(first)) & (first[np.minimum(after, len(first) - 1)] == first + n))
-    if len(pairs) < LEAST_WINDOWS:
+    if len(pairs) < MIN_WINDOWS:
         return None
     return np.asarray(MAD * np.median(np.abs(y[after[pairs]] - y[pairs]), axis=0) / np.sqrt(2.0))
 

@@ -47,8 +47,8 @@ def forking() -> Iterator[None]:
     finally:
         gc.unfreeze()
         _Processes.allowed = 0
-        for one in list(_Processes.running):
-            one.end()
+        for process in list(_Processes.running):
+            process.end()
 
 
 class Forked(Generic[T]):
@@ -67,9 +67,9 @@ class Forked(Generic[T]):
     @staticmethod
     def free() -> int:
         """Number of processors for one more; what has its result needs neither processor nor memory any more."""
-        for one in select.select(_Processes.running, [], [], 0)[0]:
-            one._read()
-        return _Processes.allowed - sum(not one._idle for one in _Processes.running)
+        for process in select.select(_Processes.running, [], [], 0)[0]:
+            process._read()
+        return _Processes.allowed - sum(not process._idle for process in _Processes.running)
 
     def fileno(self) -> int:
         """The end of the pipe by which the result comes."""
@@ -162,10 +162,10 @@ def _serve(function: Callable[[], object], writing: int) -> NoReturn:
             signal.signal(number, signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         gc.freeze()
-        said = queue.SimpleQueue[logging.LogRecord]()
-        logging.getLogger().handlers = [logging.handlers.QueueHandler(said)]
+        log_records = queue.SimpleQueue[logging.LogRecord]()
+        logging.getLogger().handlers = [logging.handlers.QueueHandler(log_records)]
         value = function()
-        records = [said.get() for _ in range(said.qsize())]
+        records = [log_records.get() for _ in range(log_records.qsize())]
         with open(writing, "wb", closefd=False) as pipe:
             pickle.dump((value, records), pipe, protocol=pickle.HIGHEST_PROTOCOL)
         code = 0

@@ -185,20 +185,20 @@ class WorkerPool:
 
         With -P no module of the current folder, such as a json.py, takes the place of Python's own.
         """
-        ours, theirs = Pipe()
+        own_end, child_end = Pipe()
         try:
             process = subprocess.Popen(
-                [sys.executable, "-P", "-c", START, str(theirs.fileno()), json.dumps(sys.path)],
+                [sys.executable, "-P", "-c", START, str(child_end.fileno()), json.dumps(sys.path)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 env={**os.environ, **ONE_THREAD},
-                **inherited(theirs.fileno()),
+                **inherited(child_end.fileno()),
             )
         except OSError as error:
             raise ConfigError(f"a worker process cannot be started ({error.strerror})", where="workers") from error
         finally:
-            theirs.close()
-        worker = _Worker(process, ours)
+            child_end.close()
+        worker = _Worker(process, own_end)
         self._workers.append(worker)
         return worker
 

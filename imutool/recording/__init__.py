@@ -24,7 +24,7 @@ UNIT_QUATERNION_TOLERANCE = 1e-6  # six printed decimals, as in the normalised E
 TURNED = 0.1  # change of a quaternion's component: a body that turns so far moves as well
 GAP_FACTOR = 4.0  # length of a gap in the truth, in median periods
 MIN_GAP_S = 0.08  # least length of a gap: a 20 Hz truth, and the 70 ms jitter of FETCH, have no gap
-LEAST_PERIOD_S = 20e-6  # an IMU has at most 32 kHz; stamps in microseconds taken for nanoseconds are closer from 50 Hz on
+MIN_PERIOD_S = 20e-6  # an IMU has at most 32 kHz; stamps in microseconds taken for nanoseconds are closer from 50 Hz on
 
 Times = Int64[np.ndarray, " n"]
 
@@ -59,9 +59,9 @@ class Imu(Columns):
         Raises:
             DataError: more than half of the samples follow within 20 µs.
         """
-        if len(self) > 1 and self.period_s < LEAST_PERIOD_S:
+        if len(self) > 1 and self.period_s < MIN_PERIOD_S:
             what = f"the IMU has {1.0 / self.period_s:.3g} samples a second: its t_ns is not in nanoseconds"
-            raise DataError(what, where=where, expected=f"steps of at least {LEAST_PERIOD_S * 1e9:.0f} ns")
+            raise DataError(what, where=where, expected=f"steps of at least {MIN_PERIOD_S * 1e9:.0f} ns")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -20,10 +20,10 @@ from imutool.array_types import Bool, Int64, Shaped
 from imutool.errors import DataError
 
 YEAR_S = 365.25 * 86400.0
-MOST_GAP_S = 3600.0  # of a pause of the recorder: a longer step of the stamps is a jump of their clock
+MAX_GAP_S = 3600.0  # of a pause of the recorder: a longer step of the stamps is a jump of their clock
 SET_BACK_NS = 1_000_000_000  # by which stamps go back at a jump; less is a sample that came late
-MOST_TOLD = 5  # jumps
-MOST_EXACT = {"f": 2**53, "i": 2**63 - 1}  # integers that float64 and int64 hold exactly
+MAX_TOLD = 5  # jumps
+MAX_EXACT = {"f": 2**53, "i": 2**63 - 1}  # integers that float64 and int64 hold exactly
 
 Rows = TypeVar("Rows", bound="Columns")
 
@@ -170,8 +170,8 @@ def _exactly(array: Shaped[np.ndarray, "..."], wanted: np.dtype[Any]) -> Shaped[
             return ns.astype(wanted) if not np.isnat(array).any() and np.array_equal(ns.astype(array.dtype), array) else None
         return None
     if array.size and kind in "iu" and kind != wanted.kind:
-        most = MOST_EXACT[wanted.kind]
-        return array.astype(wanted) if -most <= array.min() and array.max() <= most else None
+        maximum = MAX_EXACT[wanted.kind]
+        return array.astype(wanted) if -maximum <= array.min() and array.max() <= maximum else None
     return array.astype(wanted, copy=False) if not array.size or np.can_cast(array.dtype, wanted, "safe") else None
 
 
@@ -242,10 +242,10 @@ def median(values: Shaped[np.ndarray, "..."], axis: int = 0) -> Any:
 
 def clock_jumps(t_ns: Int64[np.ndarray, " n"]) -> list[tuple[int, float]]:
     """Jumps of a clock: the first stamp behind each, and the step to it (s); stamps may go back."""
-    if len(t_ns) < 2 or ((step := np.diff(t_ns)).min() > -SET_BACK_NS and step.max() <= MOST_GAP_S * 1e9):
+    if len(t_ns) < 2 or ((step := np.diff(t_ns)).min() > -SET_BACK_NS and step.max() <= MAX_GAP_S * 1e9):
         return []
     stays_back = np.append(t_ns[2:], t_ns[-1:]) < t_ns[:-1]
-    rows = np.flatnonzero((step > MOST_GAP_S * 1e9) | ((step <= -SET_BACK_NS) & stays_back))
+    rows = np.flatnonzero((step > MAX_GAP_S * 1e9) | ((step <= -SET_BACK_NS) & stays_back))
     return [(int(t_ns[row + 1]), float(step[row]) * 1e-9) for row in rows]
 
 
@@ -292,8 +292,8 @@ def _between(starts: Int64[np.ndarray, " k"], count: int) -> list[slice]:
 
 def jump_warnings(jumps: Sequence[tuple[int, float]]) -> Iterator[str]:
     """Jumps of a clock in words."""
-    for start_ns, step_s in jumps[:MOST_TOLD]:
+    for start_ns, step_s in jumps[:MAX_TOLD]:
         years = f" ({abs(step_s) / YEAR_S:.1f} years)" if abs(step_s) > YEAR_S else ""
         yield f"the clock jumps by {step_s:+.6g} s{years} to {start_ns} ns; a new stretch begins there"
-    if len(jumps) > MOST_TOLD:
-        yield f"the clock jumps {len(jumps) - MOST_TOLD} times more"
+    if len(jumps) > MAX_TOLD:
+        yield f"the clock jumps {len(jumps) - MAX_TOLD} times more"

@@ -23,15 +23,15 @@ STEPS = [
     *(("rad/s", np.deg2rad(step)) for step in WHOLE_DEG_S),
     *BNO055_STEPS.items(),
 ]
-MOST_ROWS = 100_000  # of a long table, taken evenly
-MOST_STEPS = 100.0  # from the median, within which a step that is stated to 0.1 % stays in phase
-LEAST_LENGTH = 0.85  # of the mean of the phases, where rounded decimals are a tenth of a step off
-LEAST_SUM = 25.0  # of Rayleigh's statistic on three axes: by chance it is larger 5 times in 10^9
-MOST_OFF, MOST_UNCERTAIN = 0.005, 0.003  # share by which the grid's true step differs, and its standard deviation
-LEAST_NEXT = 0.1  # share of neighbours that are one step apart: else the true step is larger
+MAX_ROWS = 100_000  # of a long table, taken evenly
+MAX_STEPS = 100.0  # from the median, within which a step that is stated to 0.1 % stays in phase
+MIN_LENGTH = 0.85  # of the mean of the phases, where rounded decimals are a tenth of a step off
+MIN_SUM = 25.0  # of Rayleigh's statistic on three axes: by chance it is larger 5 times in 10^9
+MAX_OFF, MAX_UNCERTAIN = 0.005, 0.003  # share by which the grid's true step differs, and its standard deviation
+MIN_NEXT = 0.1  # share of neighbours that are one step apart: else the true step is larger
 ROUNDED = 1e-5  # of a step: rounding moves a value by less
-MOST_COUNTS = 2.0**16  # of a register
-LEAST_WHOLE, WHOLE_OFF, WHOLE_ROWS = (
+MAX_COUNTS = 2.0**16  # of a register
+MIN_WHOLE, WHOLE_OFF, WHOLE_ROWS = (
     200,
     0.1,
     10_000,
@@ -40,7 +40,7 @@ LEAST_WHOLE, WHOLE_OFF, WHOLE_ROWS = (
 
 def unit_by_steps(rates: Float64[np.ndarray, "n 3"]) -> tuple[str, float] | None:
     """Unit of a gyro whose values are steps of a common sensor, and the step; else None."""
-    rates = rates[:: max(1, len(rates) // MOST_ROWS)]
+    rates = rates[:: max(1, len(rates) // MAX_ROWS)]
     ordered = [np.sort(axis[np.isfinite(axis)]) for axis in rates.T]
     likely = _likely(ordered, np.array([step for _, step in STEPS]))
     found = [(unit, step) for (unit, step), worth in zip(STEPS, likely, strict=True) if worth and _counts_in(ordered, step)]
@@ -53,21 +53,21 @@ def _are_whole(rates: Float64[np.ndarray, "n 3"], step: float) -> bool:
     counts = rates[np.isfinite(rates)] / step
     whole = np.sort(counts.round())  # np.unique imports numpy.ma
     whole = whole[np.diff(whole, prepend=-np.inf) > 0.0]
-    if len(whole) < LEAST_WHOLE or np.abs(counts - counts.round()).max() > WHOLE_OFF:
+    if len(whole) < MIN_WHOLE or np.abs(counts - counts.round()).max() > WHOLE_OFF:
         return False
-    return bool(np.abs(whole).max() < MOST_COUNTS and np.gcd.reduce(whole.astype(np.int64)) == 1)
+    return bool(np.abs(whole).max() < MAX_COUNTS and np.gcd.reduce(whole.astype(np.int64)) == 1)
 
 
 def _likely(ordered: Sequence[Float64[np.ndarray, " _"]], steps: Float64[np.ndarray, " m"]) -> Iterator[bool]:
     """Whether enough neighbours may be one step apart, for each step: else `_counts_in`, which rounds, need not look."""
     away = [np.abs(axis - _middle(axis)) if len(axis) else axis for axis in ordered]
-    reach, apart = (np.concatenate(x) for x in ([np.maximum(d[1:], d[:-1]) for d in away], [np.diff(x) for x in ordered]))
+    reach, distance = (np.concatenate(x) for x in ([np.maximum(d[1:], d[:-1]) for d in away], [np.diff(x) for x in ordered]))
     nearest = np.argsort(reach)
-    reach, apart = reach[nearest], apart[nearest]
-    most, least = (np.searchsorted(reach, MOST_STEPS * steps * size) for size in (1.0 + ROUNDED, 1.0 - ROUNDED))
-    for step, more, fewer in zip(steps.tolist(), most.tolist(), least.tolist(), strict=True):
-        next_to = int(np.count_nonzero(np.abs(apart[:more] - step) < (0.5 + ROUNDED) * step))
-        yield next_to >= LEAST_NEXT * int(np.count_nonzero(apart[:fewer] > ROUNDED * step))
+    reach, distance = reach[nearest], distance[nearest]
+    maximum, minimum = (np.searchsorted(reach, MAX_STEPS * steps * size) for size in (1.0 + ROUNDED, 1.0 - ROUNDED))
+    for step, more, fewer in zip(steps.tolist(), maximum.tolist(), minimum.tolist(), strict=True):
+        next_to = int(np.count_nonzero(np.abs(distance[:more] - step) < (0.5 + ROUNDED) * step))
+        yield next_to >= MIN_NEXT * int(np.count_nonzero(distance[:fewer] > ROUNDED * step))
 
 
 def _middle(ordered: Float64[np.ndarray, " n"]) -> float:
@@ -79,25 +79,25 @@ def _counts_in(ordered: Sequence[Float64[np.ndarray, " _"]], step: float) -> boo
     axes = [values for axis in ordered if len(values := _distinct(axis / step)) > 1]
     if not axes:
         return False
-    apart = np.concatenate([values[1:] - values[:-1] for values in axes])
-    if np.count_nonzero(apart[apart > 0.5].round() == 1) < LEAST_NEXT * len(apart):  # first, as phases take longest
+    steps = np.concatenate([values[1:] - values[:-1] for values in axes])
+    if np.count_nonzero(steps[steps > 0.5].round() == 1) < MIN_NEXT * len(steps):  # first, as phases take longest
         return False
     sums = [np.exp(2j * np.pi * values).sum() for values in axes]
     total = sum(abs(each) ** 2 / len(values) for each, values in zip(sums, axes, strict=True))
-    if total < LEAST_SUM or sum(map(abs, sums)) < LEAST_LENGTH * sum(map(len, axes)):
+    if total < MIN_SUM or sum(map(abs, sums)) < MIN_LENGTH * sum(map(len, axes)):
         return False
     turns = np.concatenate([np.angle(np.exp(2j * np.pi * v) / each) / (2 * np.pi) for each, v in zip(sums, axes, strict=True)])
     places = np.concatenate([values - values.mean() for values in axes])
     power = float((places**2).sum())
     off, uncertain = float((places * turns).sum()) / power, float(np.sqrt((turns**2).mean() / power))
-    return abs(off) < MOST_OFF and uncertain < MOST_UNCERTAIN
+    return abs(off) < MAX_OFF and uncertain < MAX_UNCERTAIN
 
 
 def _distinct(ordered: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:
     """Different values near the median of ordered ones."""
     if not len(ordered):
         return ordered
-    near = ordered[np.abs(ordered - _middle(ordered)) < MOST_STEPS].round(6)
+    near = ordered[np.abs(ordered - _middle(ordered)) < MAX_STEPS].round(6)
     different = np.ones(len(near), bool)
     np.not_equal(near[1:], near[:-1], out=different[1:])
     return np.asarray(near[different])

@@ -21,11 +21,11 @@ from imutool.recording.sample_order import Cleaned, in_order
 STEP_S = 0.005
 SMOOTHED = 11  # steps; the same of both sensors, so that it adds no delay
 LONGEST_S = 0.15
-MOST_S = 300.0  # of a longer log, the stretch that turns most
+MAX_S = 300.0  # of a longer log, the stretch that turns most
 PARTS = 8  # stretches whose own lags show how sure the delay is
-LEAST_CORRELATION, LEAST_PARTS = 0.6, 4
+MIN_CORRELATION, MIN_PARTS = 0.6, 4
 WINDOW_S, TURN_S = 2.0, 0.02  # over which the specific force is mostly gravity, and the steps of its turns
-LEAST_T = 3.0  # from which on a unit is certain
+MIN_T = 3.0  # from which on a unit is certain
 
 
 class SensorDelay(NamedTuple):
@@ -45,20 +45,20 @@ def sensor_delay(
     both = _together(gyro_ns, gyro, accel_ns, accel)
     if both is None:
         return None
-    most = round(LONGEST_S / STEP_S)
-    lags = np.arange(-most, most + 1)
-    products = np.stack([_products(*both, int(lag), most) for lag in lags])
+    maximum = round(LONGEST_S / STEP_S)
+    lags = np.arange(-maximum, maximum + 1)
+    products = np.stack([_products(*both, int(lag), maximum) for lag in lags])
     whole = _peak(products.sum(axis=1), lags)
     if whole is None:
         return None
     parts = [peak for part in range(PARTS) if (peak := _peak(products[:, part], lags)) is not None]
-    if len(parts) < LEAST_PARTS:
+    if len(parts) < MIN_PARTS:
         return None
     spread_s = float(np.std(parts, ddof=1)) * STEP_S / len(parts) ** 0.5
-    return SensorDelay(whole * STEP_S, max(spread_s, _least_std(both, products.sum(axis=1))))
+    return SensorDelay(whole * STEP_S, max(spread_s, _min_std(both, products.sum(axis=1))))
 
 
-def _least_std(
+def _min_std(
     both: tuple[Float64[np.ndarray, "c 3"], Float64[np.ndarray, "c 3"]], products: Float64[np.ndarray, "k 3"]
 ) -> float:
     """Least standard deviation (s) of the lag of two signals, by what they do not have in common.
@@ -67,7 +67,7 @@ def _least_std(
     n = 3 T w / pi the independent samples of three axes. A motion that repeats has the same error in each stretch.
     """
     together, measured, predicted = products.T
-    r = float(np.clip((together / np.sqrt(np.maximum(measured * predicted, 1e-300))).max(), LEAST_CORRELATION, 1.0))
+    r = float(np.clip((together / np.sqrt(np.maximum(measured * predicted, 1e-300))).max(), MIN_CORRELATION, 1.0))
     turn = -np.cross(*both)
     w = float(np.sqrt((np.gradient(turn, STEP_S, axis=0) ** 2).sum() / max(float((turn**2).sum()), 1e-300)))
     samples = 3.0 * STEP_S * len(turn) * w / np.pi
@@ -95,7 +95,7 @@ def unit_by_gravity(
     gains = lengths[best] - np.delete(lengths, best, axis=0)
     t = float((gains.mean(axis=1) * gains.shape[1] ** 0.5 / np.maximum(gains.std(axis=1, ddof=1), 1e-300)).min())
     name, size = sizes[best]
-    return (name, t) if size == units[name] and t > LEAST_T else None
+    return (name, t) if size == units[name] and t > MIN_T else None
 
 
 def steady_force(
@@ -144,8 +144,8 @@ def _together(
         return None
     rate = _resampled(gyro_ns, gyro, start, count)
     force = _resampled(accel_ns, accel, start, count)
-    if count * STEP_S > MOST_S:
-        window = round(MOST_S / STEP_S)
+    if count * STEP_S > MAX_S:
+        window = round(MAX_S / STEP_S)
         turned = np.concatenate([[0.0], np.cumsum((rate**2).sum(axis=1))])
         first = int(np.argmax(turned[window:] - turned[:-window]))
         rate, force = rate[first : first + window], force[first : first + window]
@@ -162,10 +162,10 @@ def _resampled(
 
 
 def _products(
-    rate: Float64[np.ndarray, "c 3"], force: Float64[np.ndarray, "c 3"], lag: int, most: int
+    rate: Float64[np.ndarray, "c 3"], force: Float64[np.ndarray, "c 3"], lag: int, maximum: int
 ) -> Float64[np.ndarray, "8 3"]:
     """Sums of products of measured and predicted change, and of their squares, by part."""
-    inner = slice(most, len(rate) - most)
+    inner = slice(maximum, len(rate) - maximum)
     moved = np.roll(force, -lag, axis=0)
     measured = np.gradient(moved, STEP_S, axis=0)[inner]
     predicted = -np.cross(rate, moved)[inner]
@@ -178,14 +178,14 @@ def _peak(products: Float64[np.ndarray, "k 3"], lags: Int64[np.ndarray, " k"]) -
     together, measured, predicted = products.T
     correlation = together / np.sqrt(np.maximum(measured * predicted, 1e-300))
     best = int(np.argmax(correlation))
-    if correlation[best] < LEAST_CORRELATION or best in (0, len(lags) - 1):
+    if correlation[best] < MIN_CORRELATION or best in (0, len(lags) - 1):
         return None
     before, at, after = correlation[best - 1 : best + 2]
     return float(lags[best] + 0.5 * (before - after) / (before - 2.0 * at + after))
 
 
 SHOWN_STDS = 3.0  # standard deviations from which on a delay is told from none
-LEAST_COMMON = 0.9  # share of the stamps that sensors on one clock have in common
+MIN_COMMON = 0.9  # share of the stamps that sensors on one clock have in common
 LONGEST_ALONE_S = 1.0  # of the accelerometer before and after the gyro, as sensors that start one by one have
 MAX_GAP_PERIODS = 4.0  # of the accelerometer, across which nothing is interpolated
 
@@ -218,7 +218,7 @@ def joined(
     forces = in_order(accel_ns, accel, f"{name} accel", spread=spread)
     notes = rates.notes + forces.notes
     t_ns, first, second = np.intersect1d(rates.t_ns, forces.t_ns, assume_unique=True, return_indices=True)
-    if len(t_ns) > LEAST_COMMON * max(len(rates.t_ns), len(forces.t_ns)):  # one clock: a sample that one of them lacks is none
+    if len(t_ns) > MIN_COMMON * max(len(rates.t_ns), len(forces.t_ns)):  # one clock: a sample that one of them lacks is none
         alone = len(rates.t_ns) + len(forces.t_ns) - 2 * len(t_ns)
         notes += [f"{name}: {alone} samples that gyro or accel alone has are left out"] if alone else []
         return JoinedSamples(Imu(t_ns, rates.values[first], forces.values[second]), rates.rows[first], notes)
@@ -243,8 +243,8 @@ def joined(
         notes.append(f"{name}: gyro samples without an accelerometer sample near them: {int((~inside).sum())}")
     alone = (forces.t_ns < rates.t_ns[0]) | (forces.t_ns > rates.t_ns[-1])
     if (alone_s := alone.sum() / rate_hz[1]) > LONGEST_ALONE_S:
-        said = f"{int(alone.sum())} accelerometer samples ({alone_s:.1f} s) before or after all of the gyro's are left out"
-        notes.append(f"{name}: {said}: are both of one recording?")
+        note = f"{int(alone.sum())} accelerometer samples ({alone_s:.1f} s) before or after all of the gyro's are left out"
+        notes.append(f"{name}: {note}: are both of one recording?")
     return JoinedSamples(Imu(rates.t_ns[inside], rates.values[inside], accel_there), rates.rows[inside], notes)
 
 
@@ -259,7 +259,7 @@ def _in_rows(
     """IMU of rows with both sensors; None where many rows have one of them alone."""
     has_gyro, has_accel = (np.isfinite(values).all(axis=1) for values in (gyro, accel))
     both = np.flatnonzero(has_gyro & has_accel)
-    if len(both) <= LEAST_COMMON * max(has_gyro.sum(), has_accel.sum()):
+    if len(both) <= MIN_COMMON * max(has_gyro.sum(), has_accel.sum()):
         return None
     parts = (("gyro", has_gyro), ("accel", has_accel))
     notes = [f"{name} {s}: {(~has).sum()} samples that are not finite are left out" for s, has in parts if not has.all()]

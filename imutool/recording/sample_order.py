@@ -17,12 +17,12 @@ import numpy as np
 from imutool.array_types import Bool, Float64, Int64
 from imutool.recording.columns import clock_jumps, median, quantile
 
-MOST_SET_BACK = 0.01  # share of samples that a clock which was set back may cost; of more they are several recordings
+MAX_SET_BACK = 0.01  # share of samples that a clock which was set back may cost; of more they are several recordings
 GAP_STEPS = 1.5  # median steps: a longer step holds a gap
 NEAR = 64  # stamps whose median step counts: a logger may go on at another rate
 CLEARLY = 0.9  # of the unevenness towards the next stamp: what is left at most where samples came late
-MOST_TICKS, TICK_SPAN = 8, 256  # in a period of stamps that count in coarse ticks; samples, whose spans differ by a tick or two
-MOST_ALIKE = 0.5  # share of the stamps with several samples from which on their number is that of a batch
+MAX_TICKS, TICK_SPAN = 8, 256  # in a period of stamps that count in coarse ticks; samples, whose spans differ by a tick or two
+MAX_ALIKE = 0.5  # share of the stamps with several samples from which on their number is that of a batch
 
 
 @dataclass
@@ -116,13 +116,13 @@ def _is_repeated(
     for place, column in enumerate(values.T):
         weighed += column[shared] * np.sqrt(place + 2.0)
     order = shared[np.lexsort((weighed, stamp[shared]))]
-    again = (np.diff(stamp[order]) == 0) & (np.diff(values[order], axis=0) == 0.0).all(axis=1)
+    equal = (np.diff(stamp[order]) == 0) & (np.diff(values[order], axis=0) == 0.0).all(axis=1)
     repeated = np.zeros(len(values), bool)
-    repeated[order[1:][again]] = True
+    repeated[order[1:][equal]] = True
     sizes = count[count > 1]
     repeats = np.add.reduceat(repeated, starts)
     usual = int(median(sizes))
-    if ((sizes == usual) & (repeats[count > 1] == 0)).mean() > MOST_ALIKE:
+    if ((sizes == usual) & (repeats[count > 1] == 0)).mean() > MAX_ALIKE:
         repeated[np.repeat(count == usual, count)] = False
     return repeated
 
@@ -132,15 +132,15 @@ def _spread_notes(moved_ns: Int64[np.ndarray, " n"], is_back: bool) -> list[str]
     if not moved_ns.any():
         return []
     way = "earlier than recorded, which makes the steps most even" if is_back else "later than recorded"
-    said = f"{np.count_nonzero(moved_ns)} of {len(moved_ns)} samples share the stamp of another one: they are spread evenly"
-    most_ms = np.abs(moved_ns).max() * 1e-6
-    return [f"{said}, by up to {most_ms:.6g} ms {way}; imutool convert LOG OUT --restamp puts all on a line"]
+    note = f"{np.count_nonzero(moved_ns)} of {len(moved_ns)} samples share the stamp of another one: they are spread evenly"
+    max_ms = np.abs(moved_ns).max() * 1e-6
+    return [f"{note}, by up to {max_ms:.6g} ms {way}; imutool convert LOG OUT --restamp puts all on a line"]
 
 
 def lost_to_set_back(t_ns: Int64[np.ndarray, " n"], name: str) -> list[str]:
     """Sentence on samples that have the times of others before them, where these are many."""
     lost = int((~_is_fresh(t_ns, np.diff(t_ns, prepend=t_ns[:1] - 1) != 0)).sum())
-    if lost <= MOST_SET_BACK * len(t_ns):
+    if lost <= MAX_SET_BACK * len(t_ns):
         return []
     what = f"{name}: {lost} of {len(t_ns)} samples are left out, as their time goes back to that of samples before them"
     fix = "; if the table holds several recordings, give each a table of its own, or add a column `trial` that tells them apart"
@@ -168,12 +168,12 @@ def ticked(t_ns: Int64[np.ndarray, " n"], before: Ticked | None = None) -> Ticke
         return before
     steps_us = np.rint(np.diff(t_ns) / 1000.0).astype(np.int64)  # a float of seconds since 1970 keeps a microsecond
     tick_us = int(np.gcd.reduce(steps_us[:TICK_SPAN]))
-    if tick_us <= 0 or (steps_us % tick_us).any() or median(steps_us) > MOST_TICKS * tick_us:
+    if tick_us <= 0 or (steps_us % tick_us).any() or median(steps_us) > MAX_TICKS * tick_us:
         return None
     spans_us = (t_ns[TICK_SPAN:] - t_ns[:-TICK_SPAN]) * 1e-3
     low, high = (float(quantile(spans_us, share)) for share in (0.05, 0.25))
     ticks = float(spans_us[spans_us < low + 1.5 * tick_us].mean()) / TICK_SPAN / tick_us
-    apart = abs(ticks - round(ticks))
-    if high - low > 1.5 * tick_us or ticks < 1.0 or apart * TICK_SPAN < 2.0:  # each step of whole ticks shows the period
+    fraction = abs(ticks - round(ticks))
+    if high - low > 1.5 * tick_us or ticks < 1.0 or fraction * TICK_SPAN < 2.0:  # each step of whole ticks shows the period
         return None
-    return Ticked(ticks * tick_us * 1e3, tick_us * 1e3, 1 << max(4, int(np.ceil(np.log2(2.0 / apart)))))
+    return Ticked(ticks * tick_us * 1e3, tick_us * 1e3, 1 << max(4, int(np.ceil(np.log2(2.0 / fraction)))))

@@ -21,10 +21,10 @@ from imutool.sensor.effect import Acting
 from imutool.sensor.physics_file_terms import DRIVEN
 from imutool.units import AXES
 
-MOST_READ, MOST_TRIED = 200, 6  # fields of a log that are read, and those that become channels
-LEAST_MESSAGES = 5
-LEAST_COVERAGE = 0.5  # of the IMU's time
-MOST_STATES = 16  # distinct whole numbers of an enumeration
+MAX_READ, MAX_TRIED = 200, 6  # fields of a log that are read, and those that become channels
+MIN_MESSAGES = 5
+MIN_COVERAGE = 0.5  # of the IMU's time
+MAX_STATES = 16  # distinct whole numbers of an enumeration
 CLOCK_CORRELATION = 0.9999  # with time, of a rising number that only counts
 COPY_CORRELATION = 0.9999  # with another channel
 LISTED = 12
@@ -48,7 +48,7 @@ class Channels:
         if self.untried:
             shown = ", ".join(self.untried[:LISTED])
             more = f" and {len(self.untried) - LISTED} more" if len(self.untried) > LISTED else ""
-            text += f"; not tried, for at most {MOST_TRIED} are: {shown}{more}"
+            text += f"; not tried, for at most {MAX_TRIED} are: {shown}{more}"
         return text
 
 
@@ -62,7 +62,7 @@ def with_channels(recording: Recording, path: Location) -> Channels:
     with Log(path) as log:
         moved = {topic.name for topic in log.with_schema((IMU, TF))} | set(log.pose_topics)
         brought = {name for name in log.topics if brought_by_reference(name, recording)}
-    fields = others(path, "", MOST_READ, skip={*moved, *brought, *recording.scalars, *recording.truths})
+    fields = others(path, "", MAX_READ, skip={*moved, *brought, *recording.scalars, *recording.truths})
     varying = {name: field for name, field in fields.items() if _may_drive(field, recording)}
     names = sorted(varying, key=lambda name: "temperature" not in name.lower())  # a sort keeps the log's order otherwise
     added, untried = _distinct(names, varying, scalars, recording)
@@ -91,7 +91,7 @@ def _may_drive(field: Fields, recording: Recording) -> bool:
     """Whether a field varies as a physical quantity does, over most of the recording."""
     imu, values = recording.imu, field.values
     covered = min(field.t_ns[-1], imu.t_ns[-1]) - max(field.t_ns[0], imu.t_ns[0])
-    if len(field) < LEAST_MESSAGES or covered < LEAST_COVERAGE * (imu.t_ns[-1] - imu.t_ns[0]):
+    if len(field) < MIN_MESSAGES or covered < MIN_COVERAGE * (imu.t_ns[-1] - imu.t_ns[0]):
         return False
     return len(np.unique(values)) == 2 or is_quantity(field)  # two values are a switch, which may drive
 
@@ -99,7 +99,7 @@ def _may_drive(field: Fields, recording: Recording) -> bool:
 def is_quantity(field: Fields) -> bool:
     """Whether a number is a quantity: no enumeration, counter or clock."""
     values = field.values
-    if bool((values == np.rint(values)).all()) and len(np.unique(values)) <= MOST_STATES:
+    if bool((values == np.rint(values)).all()) and len(np.unique(values)) <= MAX_STATES:
         return False
     rising = bool((np.diff(values) >= 0.0).all())
     return not (rising and _correlation(seconds(field.t_ns, int(field.t_ns[0])), values) > CLOCK_CORRELATION)
@@ -115,7 +115,7 @@ def _distinct(
     kept = [np.interp(at_s, seconds(own.t_ns, start_ns), row) for own in scalars.values() for row in own.values.T if len(own)]
     added, untried = list[str](), list[str]()
     for name in names:
-        if len(added) == MOST_TRIED:
+        if len(added) == MAX_TRIED:
             untried.append(name)
             continue
         column = np.interp(at_s, seconds(fields[name].t_ns, start_ns), fields[name].values)
@@ -133,12 +133,12 @@ def _correlation(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " n"]) -> 
 
 
 def channels_at(
-    recording: Recording, t_s: Float64[np.ndarray, " n"], start_ns: int, least_messages: int = 1
+    recording: Recording, t_s: Float64[np.ndarray, " n"], start_ns: int, min_messages: int = 1
 ) -> dict[str, Float64[np.ndarray, " n"]]:
     """Scalar channels of a log at seconds from `start_ns`, interpolated, by topic or `topic.x`."""
     out = {}
     for topic, scalars in recording.scalars.items():
-        if len(scalars) >= least_messages:
+        if len(scalars) >= min_messages:
             own_s, width = seconds(scalars.t_ns, start_ns), scalars.values.shape[1]
             for axis, column in zip(AXES, scalars.values.T, strict=False):
                 out[topic if width == 1 else f"{topic}.{axis}"] = np.interp(t_s, own_s, column)

@@ -65,7 +65,7 @@ class Parameter:
     null_value: float = 0.0
     step: float | None = None
     begins: bool = False
-    least: float | None = None
+    minimum: float | None = None
     fixed_in_training: float | None = None
 
 

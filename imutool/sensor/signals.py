@@ -26,7 +26,7 @@ SLOW_S = 0.1  # of the samples: what is faster counts as vibration
 TURN_S = 0.02  # of the rate whose derivative is the angular acceleration
 POWER_S = 0.5  # of the squared vibration
 TAU_S = np.array([SLOW_S] * 6 + [TURN_S] * 3 + [POWER_S] * 3)
-LEAST_PERIODS = 0.1
+MIN_PERIODS = 0.1
 BLOCK = 64  # samples of a matrix product in `low_pass`
 
 # columns of the signals: the samples, the filters' whole state, and derivatives
@@ -119,7 +119,7 @@ class SignalFilter:
         self._period_s = 1.0 / rate_hz
         self._lag_s = self._period_s / math.expm1(self._period_s / TURN_S)
         self._lead = np.full(3, (1.0 / self._gain[6] - 1.0) / self._lag_s)  # from the filter's last step to what it lags by
-        self._least_s = LEAST_PERIODS * self._period_s
+        self._min_s = MIN_PERIODS * self._period_s
         self._t_s = math.nan
         self._row, self._step = np.zeros(COUNT), np.zeros(12)
         self._cut()
@@ -156,7 +156,7 @@ class SignalFilter:
             self._begin(t_s, u)
         if self._derives:
             np.subtract(u, self._u, self._dots)
-            self._dots *= 1.0 / max(t_s - self._t_s, self._least_s)
+            self._dots *= 1.0 / max(t_s - self._t_s, self._min_s)
         self._u[:] = u
         if self._filters:
             step, power = self._step, self._step_power
@@ -189,7 +189,7 @@ class SignalFilter:
             states = [low_pass(load, gain, state) for gain, state in zip(self._load_gain.flat, self._load, strict=True)]
             columns[:, LOAD] = np.concatenate(states, axis=1)
         if self._derives:
-            step_s = np.maximum(np.diff(t_s, prepend=self._t_s), self._least_s)[:, None]
+            step_s = np.maximum(np.diff(t_s, prepend=self._t_s), self._min_s)[:, None]
             columns[:, DOTS] = np.diff(u, axis=0, prepend=self._u[None]) / step_s
             columns[:, ALPHA] = (gyro - columns[:, TURN]) / self._lag_s
         self._row[:], self._t_s = columns[-1], float(t_s[-1])

@@ -40,8 +40,8 @@ from imutool.sensor.trajectory import SmoothMotion, smooth_motion
 SCHEMA = "imutool.simulation/1"
 RATE_HZ = 200.0  # of a trajectory without an IMU
 SLOWEST_HZ, FASTEST_HZ = 10.0, 4000.0
-LEAST_S = 2.0  # of trusted motion
-MOST_M_S2 = 100.0  # median acceleration; ten times gravity for half of the time is no body's
+MIN_S = 2.0  # of trusted motion
+MAX_M_S2 = 100.0  # median acceleration; ten times gravity for half of the time is no body's
 MOTION_HZ = 400.0  # of the motion's clock, at least: filters and shifts act there before samples are taken
 MOTION_TOPIC = "/motion/pose"  # the exact motion of the samples; the truth that it was smoothed from is copied
 TRUTH_TOPIC = "/ground_truth/pose"
@@ -166,10 +166,10 @@ def simulated(
     """
     _check(rate_hz, seed)
     motion = smooth_motion(source.truth)
-    if motion.duration_s < LEAST_S:
+    if motion.duration_s < MIN_S:
         raise DataError(
             f"{motion.duration_s:.2f} s of the motion can be trusted",
-            expected=f"{LEAST_S:g} s of poses without a hole, and more",
+            expected=f"{MIN_S:g} s of poses without a hole, and more",
             fix="Give a longer trajectory",
         )
     ideals = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
@@ -247,7 +247,7 @@ def _of_poses(motion: SmoothMotion, poses: Poses, ideals: Sequence[IdealMotion],
     if (left_out := poses.duration_s - motion.duration_s) > 0.05 * poses.duration_s:
         yield f"{left_out:.1f} s of {poses.duration_s:.1f} s are left out: holes and glitches of the poses, and their ends"
     force = float(median(np.concatenate([quaternion.length(ideal.accel) for ideal in ideals])))
-    if force > MOST_M_S2:
+    if force > MAX_M_S2:
         yield f"the motion has a specific force of {force:.3g} m/s² in the median; are its positions in metres?"
 
 

@@ -25,7 +25,7 @@ ROUGHNESS = 3  # the derivative that is white: jerk, so that accelerations wande
 FREQUENCIES = 512  # at which symbols are summed
 COARSE = 24  # cut-offs tried before the best is refined
 LOWEST_HZ = 0.2
-LEAST_ANGLE = 1e-2  # of a knot at the lowest cut-off: its sixth power is the condition of the matrices
+MIN_ANGLE = 1e-2  # of a knot at the lowest cut-off: its sixth power is the condition of the matrices
 # Of the likeliest cut-off: real poses err more slowly than white noise. Against the IMU of TUM-VI room1 and room3 and of FETCH
 # 03 and 06, 0.85 leaves 15, 19, 5 and 3 per cent less error of the specific force than 1; EuRoC's lose half a per cent.
 CAUTION = 0.85
@@ -56,8 +56,8 @@ class Penalised:
 
     def residual(self) -> Values:
         """Residual: samples minus the curve."""
-        left: Values = self.samples.y - self.samples.fitted(np.asarray(self.spline.c))
-        return left
+        residual_values: Values = self.samples.y - self.samples.fitted(np.asarray(self.spline.c))
+        return residual_values
 
     def std(self, derivative: int) -> float:
         """Standard deviation of a derivative amid the data, by smoothing and noise, one coordinate.
@@ -77,10 +77,10 @@ class Penalised:
             both.append(np.mean(response * spread))
         return self.noise * float(np.sqrt(np.mean(both)))
 
-    def end_s(self, derivative: int, worse: float, least: float) -> float:
+    def end_s(self, derivative: int, worse: float, minimum: float) -> float:
         """Time (s) from an end within which a derivative is uncertain.
 
-        There its deviation is above `least` and `worse` times the inner one.
+        There its deviation is above `minimum` and `worse` times the inner one.
 
         From the posterior of an even piece as dense as the data, in full; at most half of that piece.
         """
@@ -97,7 +97,7 @@ class Penalised:
         t_s = np.arange(0.0, length_s / 2.0, own.knot_s / 2.0)
         values = np.asarray(BSpline(piece.knots, np.eye(piece.count), DEGREE)(t_s, derivative))
         std = self.noise * np.sqrt(np.einsum("nc,cn->n", values, np.linalg.solve(matrix, values.T)))
-        poor = np.flatnonzero(std > max(least, worse * float(std[len(std) // 2 :].max())))
+        poor = np.flatnonzero(std > max(minimum, worse * float(std[len(std) // 2 :].max())))
         return float(t_s[poor[-1]]) if len(poor) else 0.0
 
 
@@ -197,7 +197,7 @@ class Samples:
         def cost(log_hz: float) -> float:
             return self.unlikelihood(float(np.exp(log_hz)))[0]
 
-        lowest_hz = max(min(LOWEST_HZ, self.highest_hz / 10.0), LEAST_ANGLE / (2.0 * np.pi * self.knot_s))
+        lowest_hz = max(min(LOWEST_HZ, self.highest_hz / 10.0), MIN_ANGLE / (2.0 * np.pi * self.knot_s))
         tried = np.log(np.geomspace(lowest_hz, self.highest_hz, COARSE)).tolist()
         known = cache(lambda k: cost(tried[k]))
         k = min(range(COARSE), key=known) if near_hz is None else int(np.abs(tried - np.log(near_hz)).argmin())

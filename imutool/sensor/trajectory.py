@@ -26,10 +26,10 @@ from imutool.sensor.smoothing import Penalised, Samples
 
 MAX_GAP_S = 0.1  # a longer hole ends a stretch: nothing is invented across it
 KNOT_PERIODS = 2.0  # between knots: half the poses' own bandwidth, which noise never leaves
-LEAST_KNOT_S = 1e-3  # also where stamps come in bursts
-MOST_KNOT_S = 0.02  # but for slow poses a knot each: 25 Hz is what a body moves with
-LEAST_POSES = 25
-LEAST_S = 0.5  # a shorter stretch is all ends
+MIN_KNOT_S = 1e-3  # also where stamps come in bursts
+MAX_KNOT_S = 0.02  # but for slow poses a knot each: 25 Hz is what a body moves with
+MIN_POSES = 25
+MIN_S = 0.5  # a shorter stretch is all ends
 PASSES = 4  # fits, each with the weights of the one before
 FIRST_CUTOFF_HZ = 12.0  # of the first pass: higher, it would follow the glitches that it is to find
 HUMP = 3.0  # residuals of this many sigmas count half; of GLITCH they are dropped
@@ -39,17 +39,17 @@ WEIGHED = 0.8196  # root of the mean of r² / 3 / (1 + r² / 9) for three unit n
 USUAL_S = 2.0  # time that says what residual is usual: poses err more in motion (their stamps) than at rest
 USUAL_PERCENTILE = 75.0  # of it: a motion that begins is no glitch, and a quarter of a second in two may be one
 USUAL_NORM = 2.0269  # that percentile of the length of three unit normal numbers; a unit quaternion, too, errs in three
-LEAST_NOISE = 3e-6  # m, or half of rad: what is less is rounding, and nothing a glitch beside it
+MIN_NOISE = 3e-6  # m, or half of rad: what is less is rounding, and nothing a glitch beside it
 END_WORSE = 1.15  # where a derivative's standard deviation is this many times that amid the data, it is an end
 END_KNOTS = 5  # and no less: as far as a basis function at the end reaches, and a time constant of the smoothing
-LEAST_GYRO, LEAST_ACCEL = 1e-5, 1e-4  # rad/s (half), m/s²: exact poses have no ends worth leaving out
+MIN_GYRO, MIN_ACCEL = 1e-5, 1e-4  # rad/s (half), m/s²: exact poses have no ends worth leaving out
 STEP = 10.0  # median sizes by which a sample's step must differ from its neighbours'
 STEP_WINDOW = 10  # samples on either side that say how large a step is
 STEP_SMOOTH_HZ = 0.15  # the levelled steps come back this slowly: a centimetre adds 0.01 m/s²
 GLITCH_SAMPLES, NOT_BACK = 4, 0.3  # steps so close together that leave less than this share of the largest are a glitch
 EXPLAINED = 0.3  # of what is odd about it must be left, or it is no step
 LOCAL = 101  # samples whose median says what size is usual
-MOST_STEPS = 0.1  # of the samples; more are no steps but noise
+MAX_STEPS = 0.1  # of the samples; more are no steps but noise
 MAX_RATE_HZ = 100_000.0
 
 Times = Float64[np.ndarray, " n"]
@@ -81,7 +81,7 @@ class Stretch:
     @property
     def measured(self) -> bool:
         """Whether poses have more noise than rounding."""
-        return bool(self.noise_m > LEAST_NOISE or self.noise_rad > 2.0 * LEAST_NOISE)
+        return bool(self.noise_m > MIN_NOISE or self.noise_rad > 2.0 * MIN_NOISE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +171,7 @@ def _smoothed(poses: Poses, passes: int) -> SmoothMotion:
     waiting = [np.arange(a, b) for a, b in _unbroken(t_s)][::-1]
     while waiting:
         rows = waiting.pop()
-        if len(rows) < LEAST_POSES or t_s[rows[-1]] - t_s[rows[0]] < LEAST_S:
+        if len(rows) < MIN_POSES or t_s[rows[-1]] - t_s[rows[0]] < MIN_S:
             continue
         rotation = Forked(partial(_fitted, t_s[rows], columns[1][rows], passes))
         position, count = _levelled(t_s[rows], columns[0][rows])
@@ -192,7 +192,7 @@ def _smoothed(poses: Poses, passes: int) -> SmoothMotion:
         rate = f" at {1.0 / np.median(step_s):.3g} Hz, with {holes} steps above {MAX_GAP_S:g} s," if len(step_s) else ""
         raise DataError(
             f"no stretch of the {len(poses)} poses{rate} can be differentiated",
-            expected=f"poses at 40 Hz or more: {LEAST_POSES} over {LEAST_S:g} s and more, without a step above {MAX_GAP_S:g} s",
+            expected=f"poses at 40 Hz or more: {MIN_POSES} over {MIN_S:g} s and more, without a step above {MAX_GAP_S:g} s",
         )
     return SmoothMotion(int(poses.t_ns[0]), tuple(stretches), glitches, steps)
 
@@ -210,7 +210,7 @@ def _fitted(t_s: Times, y: Values, passes: int) -> tuple[Penalised, Times]:
     Weights 1 / (1 + (r / 3 sigma)²), those of heavy tails, so that a fit with a few wild samples still converges.
     """
     period_s = float(np.median(np.diff(t_s)))
-    knot_s = max(period_s, min(KNOT_PERIODS * period_s, MOST_KNOT_S), LEAST_KNOT_S)
+    knot_s = max(period_s, min(KNOT_PERIODS * period_s, MAX_KNOT_S), MIN_KNOT_S)
     weights, window = np.ones(len(t_s)), min(2 * round(0.5 * USUAL_S / period_s), len(t_s)) + 1
     near_hz = None
     for index in range(passes):
@@ -220,7 +220,7 @@ def _fitted(t_s: Times, y: Values, passes: int) -> tuple[Penalised, Times]:
         near_hz = fit.cutoff_hz if index else None
         size = np.linalg.norm(fit.residual(), axis=1)
         local = percentile_filter(size, USUAL_PERCENTILE, window, mode="mirror")  # an end is not its own measure
-        usual = np.maximum(np.maximum(local, np.median(size)) / USUAL_NORM, LEAST_NOISE)
+        usual = np.maximum(np.maximum(local, np.median(size)) / USUAL_NORM, MIN_NOISE)
         if index < passes - 1:
             weights = 1.0 / (1.0 + (size / (HUMP * usual)) ** 2)
         if 0 < index < passes - 1:  # the first fit has an arbitrary cut-off: it drops nothing
@@ -231,9 +231,9 @@ def _fitted(t_s: Times, y: Values, passes: int) -> tuple[Penalised, Times]:
 def _stretch(start_ns: int, t_s: Times, position: Penalised, rotation: Penalised) -> Stretch:
     """The stretch and its trusted part."""
     end_s = 0.0
-    for curve, derivative, least in ((position, 2, LEAST_ACCEL), (rotation, 1, LEAST_GYRO)):
-        lag_s = 1.0 / (2.0 * np.pi * curve.cutoff_hz) if curve.std(derivative) > least else 0.0
-        end_s = max(end_s, curve.end_s(derivative, END_WORSE, least), END_KNOTS * curve.samples.knot_s + lag_s)
+    for curve, derivative, minimum in ((position, 2, MIN_ACCEL), (rotation, 1, MIN_GYRO)):
+        lag_s = 1.0 / (2.0 * np.pi * curve.cutoff_hz) if curve.std(derivative) > minimum else 0.0
+        end_s = max(end_s, curve.end_s(derivative, END_WORSE, minimum), END_KNOTS * curve.samples.knot_s + lag_s)
     tilt = GRAVITY_M_S2 * ANGLE * rotation.std(0)
     return Stretch(
         trajectory=Trajectory(start_ns, position.spline, rotation.spline),
@@ -254,7 +254,7 @@ def _levelled(t_s: Times, y: Values) -> tuple[Values, int]:
     fitted to the samples around it. Steps that soon go back are a glitch, and stay.
     """
     at = _steps(t_s, y)
-    if not len(at) or len(at) > MOST_STEPS * len(t_s):
+    if not len(at) or len(at) > MAX_STEPS * len(t_s):
         return y, 0
     jump = np.zeros_like(y)
     runs = np.split(at, np.flatnonzero(np.diff(at) > GLITCH_SAMPLES) + 1)
@@ -284,7 +284,7 @@ def _unexplained_difference(t_s: Times, y: Values) -> Values:
 def _steps(t_s: Times, y: Values) -> Int64[np.ndarray, " s"]:
     """Rows before which the position seems to step."""
     size = np.linalg.norm(_unexplained_difference(t_s, y), axis=1)
-    usual = np.maximum(np.maximum(median_filter(size, LOCAL, mode="nearest"), np.median(size)), LEAST_NOISE)
+    usual = np.maximum(np.maximum(median_filter(size, LOCAL, mode="nearest"), np.median(size)), MIN_NOISE)
     around = np.max([np.roll(size, shift) for shift in (-2, -1, 1, 2)], axis=0)
     return np.asarray(np.flatnonzero((size > STEP * usual) & (size >= 0.9 * around)))
 

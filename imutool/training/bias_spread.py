@@ -18,7 +18,7 @@ from imutool.bias.model import COLUMNS, Vector6
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.networks.threads import of_each
 from imutool.bias_start.bias_at_rest import rest_differences
-from imutool.bias_start.bias_from_truth import LEAST_TRUTH_STD, TRUTH_S, bias_from_truth
+from imutool.bias_start.bias_from_truth import MIN_TRUTH_STD, TRUTH_S, bias_from_truth
 from imutool.bias_start.initial_bias import AT_REST_STD, SESSION_GAP_S
 from imutool.bias_start.prior_width import USUAL_WALK
 from imutool.geometry import so3
@@ -31,13 +31,13 @@ from imutool.units import SENSORS, Sensor
 
 MAD_TO_STD = 1.4826
 TURN_ON_STD = {"gyro": 5e-3, "accel": 0.1}  # of a switching-on: ADIS16448 2e-3 over four months, BMI160 up to 5e-2 (data sheet)
-MOST_TURN_ON = 11.0  # by the size of the biases themselves: three as small have a chance of one in a thousand
+MAX_TURN_ON = 11.0  # by the size of the biases themselves: three as small have a chance of one in a thousand
 USUAL_STD = {"gyro": 5e-4, "accel": 2e-2}  # between logs of one switching-on
-MOST_TAIL, LEAST_FREEDOM = 3.0, 0.1  # variance of Student's t: three degrees of freedom, or fewer, count as three
+MAX_TAIL, MIN_FREEDOM = 3.0, 0.1  # variance of Student's t: three degrees of freedom, or fewer, count as three
 SESSION_STEP = {"gyro": 3e-3, "accel": 0.3}  # another switching-on: a larger step of the bias from one log to the next
-LEAST_TRUSTED, FEWEST_STARTS = 0.5, 4
+MIN_TRUSTED, FEWEST_STARTS = 0.5, 4
 WALKS, WALK_FACTOR = np.geomspace(0.01, 30.0, 24), 3.0  # multiples of the usual walk; deviation of the prior, as a factor
-WALK_WINDOW_S, MOST_WINDOWS, LEAST_COMBINATIONS, LEAST_SQUARE = 2.5, 24, 3, 1e-18
+WALK_WINDOW_S, MAX_WINDOWS, MIN_COMBINATIONS, MIN_SQUARE = 2.5, 24, 3, 1e-18
 LONGEST_WALK_WINDOW_S = {"gyro": 30.0, "accel": 5.0}  # a bias of the gyro tilts the accelerometer's windows
 AVERAGED_S, AVERAGED = 1.0, 8  # windows that begin within this time, whose mean has less of the poses' noise
 POSE_ERROR_S = (0.3, 3.0, 30.0)  # how long errors of the poses last
@@ -63,39 +63,39 @@ class Session:
 class TurnOn(NamedTuple):
     """Rest bias of the next session, and the sessions known.
 
-    Its standard deviation is `std` for a sensor of the usual kind, and may be as little as `least_std`.
+    Its standard deviation is `std` for a sensor of the usual kind, and may be as little as `min_std`.
     """
 
     mean: Vector6
     std: Vector6
-    least_std: Vector6
+    min_std: Vector6
     sessions: list[Session]
 
     def card(self) -> dict[str, Any]:
         """Entries of a model card."""
-        return {"sessions": [session.card() for session in self.sessions], "turn_on_least_std": self.least_std.tolist()}
+        return {"sessions": [session.card() for session in self.sessions], "turn_on_least_std": self.min_std.tolist()}
 
 
 def store_statistics(
     model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
 ) -> TurnOn:
     """Store the prior, the spread of starts from truth and the noise; return the prior."""
-    scored, left = corrected(model, pool)
+    scored, residual = corrected(model, pool)
     rest, std = rest.clone(), torch.zeros_like(rest)
     shown = np.repeat([sensor in pool.sensors for sensor in SENSORS], 3)
     model.noise_std.copy_(torch.from_numpy(white_noise(torch.cat([pool.gyro, pool.accel], dim=1).cpu().numpy())))
     for sensor in pool.sensors:
         columns = COLUMNS[sensor]
-        solution = closed_form.solve(scored, sensor, left, rest, window_s[sensor], matrix=False, part="all")
+        solution = closed_form.solve(scored, sensor, residual, rest, window_s[sensor], matrix=False, part="all")
         rest[:, columns], std[:, columns] = solution.rest, solution.std
     biases = rest.cpu().double().numpy()
     turn_on = turn_on_prior(np.where(shown, biases, np.nan), pool.spans_ns)
     model.prior_mean.copy_(torch.from_numpy(turn_on.mean))
     model.prior_std.copy_(torch.from_numpy(turn_on.std))
-    model.truth_std.copy_(_start_spread(scored, left, rest))
-    model.walk_std.copy_(_walk(scored, left, rest))
-    velocities = [left.v_w[left.log == log].cpu().double().numpy() for log in range(len(left.names))]
-    stops = [np.where(shown, rows, 0.0) for rows in rest_differences(scored.frozen(), _samples(left), biases, velocities)]
+    model.truth_std.copy_(_start_spread(scored, residual, rest))
+    model.walk_std.copy_(_walk(scored, residual, rest))
+    velocities = [residual.v_w[residual.log == log].cpu().double().numpy() for log in range(len(residual.names))]
+    stops = [np.where(shown, rows, 0.0) for rows in rest_differences(scored.frozen(), _samples(residual), biases, velocities)]
     model.rest_std.copy_(torch.from_numpy(shift_at_rest(stops, std.cpu().double().numpy())))
     return turn_on
 
@@ -107,24 +107,24 @@ def turn_on_prior(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[
     (sum (m_s - m)^2 + TURN_ON_STD^2) / S (1 + 1/S): the size that sensors usually have counts as one session more. Without it
     this is the least variance, of a sensor that repeats its bias as well as between the logs of one session.
     Within a session the variance comes from n logs, as many degrees of freedom too few to be known: the next log follows
-    Student's t, whose variance is n / (n - 2) times larger, at most `MOST_TAIL`. Where most logs that follow each other closely
+    Student's t, whose variance is n / (n - 2) times larger, at most `MAX_TAIL`. Where most logs that follow each other closely
     differ all the same, the next log is of a session of its own, and no session is returned. A bias that no log shows is NaN:
-    zero is expected of it, with `TURN_ON_STD`. No size exceeds that of the biases by more than `MOST_TURN_ON`: after another
+    zero is expected of it, with `TURN_ON_STD`. No size exceeds that of the biases by more than `MAX_TURN_ON`: after another
     turn-on a fibre-optic gyro has 1e-5 rad/s again.
     """
     known, rest = np.isfinite(rest).all(axis=0), np.nan_to_num(rest)
     groups, broken = _sessions(rest, spans_ns)
     means = np.stack([rest[group].mean(axis=0) for group in groups])
     usual, turn_on = (np.repeat([size[sensor] for sensor in SENSORS], 3) for size in (USUAL_STD, TURN_ON_STD))
-    most = MOST_TURN_ON * np.repeat(np.sqrt((means.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2))), 3)
-    usual, turn_on = (np.where(known, np.minimum(std, most), std) for std in (usual, turn_on))
+    maximum = MAX_TURN_ON * np.repeat(np.sqrt((means.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2))), 3)
+    usual, turn_on = (np.where(known, np.minimum(std, maximum), std) for std in (usual, turn_on))
     squares = sum(((rest[group] - mean) ** 2).sum(axis=0) for group, mean in zip(groups, means, strict=True))
     freedom = len(rest) - len(groups) + 1
-    within = (squares + usual**2) / freedom * min(MOST_TAIL, freedom / max(freedom - 2.0, LEAST_FREEDOM))
+    within = (squares + usual**2) / freedom * min(MAX_TAIL, freedom / max(freedom - 2.0, MIN_FREEDOM))
     mean, count = means.mean(axis=0), len(groups)
-    apart = ((means - mean) ** 2).sum(axis=0)
-    most, least = ((apart + one_more) / count * (1 + 1 / count) + within for one_more in (turn_on**2, 0.0))
-    most, least, within = (np.where(known, variance, turn_on**2) for variance in (most, least, within))
+    scatter = ((means - mean) ** 2).sum(axis=0)
+    maximum, minimum = ((scatter + one_more) / count * (1 + 1 / count) + within for one_more in (turn_on**2, 0.0))
+    maximum, minimum, within = (np.where(known, variance, turn_on**2) for variance in (maximum, minimum, within))
     sessions = [
         Session(
             min(spans_ns[log][0] for log in group),
@@ -135,7 +135,7 @@ def turn_on_prior(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[
         for group, of_group in zip(groups, means, strict=True)
         if broken <= len(rest) - len(groups)
     ]
-    return TurnOn(mean, np.sqrt(most), np.sqrt(least), sessions)
+    return TurnOn(mean, np.sqrt(maximum), np.sqrt(minimum), sessions)
 
 
 def _sessions(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[int, int]]) -> tuple[list[list[int]], int]:
@@ -199,7 +199,7 @@ def _log_likelihood_of_walks(
     eigenvalues, V = torch.linalg.eigh(torch.linalg.solve_triangular(L, by_L.mT, upper=False))
     square = (V.mT @ torch.linalg.solve_triangular(L, y.expand(len(L), -1, 1), upper=False))[..., 0].square()
     walks = (torch.from_numpy(WALKS).to(y) * USUAL_WALK[COLUMNS[sensor].start]) ** 2
-    scale = torch.from_numpy(ERROR_SHARES).to(y) * y.square().mean().clamp_min(LEAST_SQUARE)
+    scale = torch.from_numpy(ERROR_SHARES).to(y) * y.square().mean().clamp_min(MIN_SQUARE)
     variance = scale[:, None, None] + walks[:, None, None, None] * eigenvalues.clamp_min(0.0)
     log_likelihood = -0.5 * (square / variance + variance.log()).sum(-1) - torch.diagonal(L, dim1=1, dim2=2).log().sum(1)
     return torch.logsumexp(log_likelihood.flatten(1), dim=1)
@@ -210,14 +210,14 @@ def _walked_residuals(
 ) -> tuple[Float[Tensor, "r 1"], Float[Tensor, "r r"], Float[Tensor, "times r r"]] | None:
     """Combinations of a log's residuals that no constant changes; their covariances by walks and by pose errors of one."""
     begin, end = (int(torch.searchsorted(pool.log, log, right=right)) for right in (False, True))
-    n = pool.samples(min(max((end - begin) / pool.rate_hz / MOST_WINDOWS, WALK_WINDOW_S), LONGEST_WALK_WINDOW_S[sensor]))
+    n = pool.samples(min(max((end - begin) / pool.rate_hz / MAX_WINDOWS, WALK_WINDOW_S), LONGEST_WALK_WINDOW_S[sensor]))
     later = torch.linspace(0, min(pool.samples(AVERAGED_S), n // 2), AVERAGED, device=pool.t.device).long()
     first = n * torch.arange(max(end - begin - 1 - int(later[-1]), 0) // n, device=pool.t.device)
     at, trusted = first[:, None] + later, pool.trusted[begin:end]
     broken = torch.cumsum(pool.late[begin:end] | ~trusted, dim=0)
     first = begin + first[((broken[at + n] == broken[at]) & trusted[at]).all(1)]
-    first = first[:: max(1, -(-len(first) // MOST_WINDOWS))]
-    if 3 * len(first) < 3 + len(NUISANCE_STD[sensor]) + LEAST_COMBINATIONS:
+    first = first[:: max(1, -(-len(first) // MAX_WINDOWS))]
+    if 3 * len(first) < 3 + len(NUISANCE_STD[sensor]) + MIN_COMBINATIONS:
         return None
     means = []
     for start in first + later[:, None]:
@@ -238,8 +238,8 @@ def _walked_residuals(
 
 def _of_differences(begins: Float[Tensor, " m"], ends: Float[Tensor, " m"], error_s: float) -> Float[Tensor, "m m"]:
     """Covariance of end minus begin of an error of unit variance that decays by e in `error_s`."""
-    t_s, one = torch.cat([begins, ends]), torch.eye(len(begins)).to(begins)
-    minus = torch.cat([-one, one], dim=1)
+    t_s, eye = torch.cat([begins, ends]), torch.eye(len(begins)).to(begins)
+    minus = torch.cat([-eye, eye], dim=1)
     return minus @ torch.exp(-(t_s[:, None] - t_s).abs() / error_s) @ minus.mT
 
 
@@ -253,22 +253,22 @@ def _start_spread(model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"])
         log, first = start
         some = rows_of[log][(rows_of[log] >= first) & (rows_of[log] <= first + n)]
         trusted = pool.trusted[some]
-        if len(some) <= n or not bool(trusted[0]) or float(trusted.double().mean()) < LEAST_TRUSTED:
+        if len(some) <= n or not bool(trusted[0]) or float(trusted.double().mean()) < MIN_TRUSTED:
             return None
         u = torch.cat([pool.gyro[some], pool.accel[some]], dim=1)
         t = pool.t[some] - pool.t[some[0]]
         segment = Segment(t[None], u[None, :, :3], u[None, :, 3:], rest[log][None])
-        left = (u - model(segment)[0]).cpu().double().numpy()
+        residual = (u - model(segment)[0]).cpu().double().numpy()
         q_wb_wxyz = so3.quaternion_wxyz_from_matrix(pool.R_wb[some].double())
         seconds, q, v_w = (x.cpu().double().numpy() for x in (t, q_wb_wxyz, pool.v_w[some]))
-        return bias_from_truth(seconds, left, q, v_w, trusted.cpu().numpy())
+        return bias_from_truth(seconds, residual, q, v_w, trusted.cpu().numpy())
 
     starts = [(log, first) for log, rows in enumerate(rows_of) for first in rows[:: max(1, n // 2)].tolist()]
     off = [bias for bias in of_each(missed, starts) if bias is not None]
     unknown = torch.tensor([TURN_ON_STD["gyro"]] * 3 + [TURN_ON_STD["accel"]] * 3).to(rest)
     if len(off) < FEWEST_STARTS:
         return unknown
-    spread = np.maximum(MAD_TO_STD * np.median(np.abs(off), axis=0), LEAST_TRUTH_STD)
+    spread = np.maximum(MAD_TO_STD * np.median(np.abs(off), axis=0), MIN_TRUTH_STD)
     shown = torch.tensor([sensor in pool.sensors for sensor in SENSORS]).repeat_interleave(3).to(rest.device)
     return torch.where(shown, torch.from_numpy(spread).to(rest), unknown)
 

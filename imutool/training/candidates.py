@@ -26,7 +26,7 @@ from imutool.training.calibration.effect_selection import (
     parameter_columns,
 )
 from imutool.training.calibration.filter_settings import filter_settings
-from imutool.training.calibration.log_scatter import LEAST_GAIN
+from imutool.training.calibration.log_scatter import MIN_GAIN
 from imutool.training.calibration.shared_parameters import gain_of
 from imutool.training.log_signals import effects_turned_alike
 from imutool.training.settings import TrainSettings
@@ -57,7 +57,7 @@ def best_predicted(fit: Calibration, sensor: Sensor, candidates: Sequence[str]) 
     constant = loss = fit.problem.predicted(columns[best])
     for candidate in others:
         new = fit.problem.predicted(columns[candidate])
-        if gain_of(new, constant) >= PARTS_GAIN and gain_of(new, loss) >= LEAST_GAIN:
+        if gain_of(new, constant) >= PARTS_GAIN and gain_of(new, loss) >= MIN_GAIN:
             best, loss = candidate, new
     return best
 

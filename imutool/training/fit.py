@@ -246,8 +246,8 @@ class Training:
 
         losses, gradients = zip(*of_each(derived, [*stage.objective.terms(self.generator), wandering]), strict=True)
         for tensor, *parts in zip(free, *gradients, strict=True):
-            there = [part for part in parts if part is not None]
-            tensor.grad = torch.stack(there).sum(0) if there else None
+            known = [part for part in parts if part is not None]
+            tensor.grad = torch.stack(known).sum(0) if known else None
         return math.fsum(losses)
 
     def _set_training(self, stage: Stage) -> None:

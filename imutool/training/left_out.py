@@ -37,7 +37,7 @@ from imutool.inertial.strapdown import along_truth, drift
 from imutool.processes.forked import of_each
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
 from imutool.training.calibration.effect_selection import LINEAR, Calibration, parameter_columns
-from imutool.training.calibration.log_scatter import LEAST_GAIN, SURELY
+from imutool.training.calibration.log_scatter import MIN_GAIN, SURELY
 from imutool.training.candidates import CANDIDATES, best_predicted, known, left_out_effects, left_out_model, with_statistics
 from imutool.training.log_agreement import Contradiction, check_axes, contradicting
 from imutool.training.log_signals import without_nuisances
@@ -49,9 +49,9 @@ logger = logging.getLogger(__name__)
 
 STARTS = ("auto", "smooth", "truth")
 CHANCE = 0.3  # least deviation of a sum of gains over logs, in logarithms of errors, that candidates without a true effect have
-LEAST_ERROR = 1e-6  # ° or m/s
+MIN_ERROR = 1e-6  # ° or m/s
 LONGEST_S = 120.0  # of a log that is scored
-MOST_OF_LOG = 0.5  # that a start from the truth takes: scored on the same seconds, a constant would explain all of them
+MAX_OF_LOG = 0.5  # that a start from the truth takes: scored on the same seconds, a constant would explain all of them
 DRIFT_S = 5.0
 
 
@@ -214,13 +214,13 @@ def _log_errors(scores: Sequence[Score], logs: Sequence[str], model: str, criter
     out = []
     for log in logs:
         some = [score for score in scores if (score.model, score.log) == (model, log) and criterion.start in ("", score.start)]
-        known = [max(value, LEAST_ERROR) for score in some if (value := getattr(score, criterion.field)) is not None]
+        known = [max(value, MIN_ERROR) for score in some if (value := getattr(score, criterion.field)) is not None]
         out.append(float(np.mean(np.log(known))) if known else np.nan)
     return np.array(out)
 
 
 def beaten(errors: Float64[np.ndarray, " logs"], others: Float64[np.ndarray, " logs"], surely: float = 1.0) -> bool:
-    """Whether errors are smaller by `LEAST_GAIN` and by `surely` standard errors over the logs.
+    """Whether errors are smaller by `MIN_GAIN` and by `surely` standard errors over the logs.
 
     A true gain scatters from log to log, too, if only some motions show it. So a gain also counts that is beyond chance without
     the log that gains most. Chance loses as often as it gains, so the losses show its variance.
@@ -229,11 +229,11 @@ def beaten(errors: Float64[np.ndarray, " logs"], others: Float64[np.ndarray, " l
     if not len(gain):
         return False
     scatter = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
-    if gain.mean() > max(LEAST_GAIN, surely * scatter):
+    if gain.mean() > max(MIN_GAIN, surely * scatter):
         return True
     rest = gain[:-1]
     chance = np.sqrt(2.0 * np.square(np.minimum(rest, 0.0)).sum() + CHANCE**2)
-    return len(rest) > 0 and bool(rest.mean() > max(LEAST_GAIN, surely * chance / len(rest)))
+    return len(rest) > 0 and bool(rest.mean() > max(MIN_GAIN, surely * chance / len(rest)))
 
 
 def _without_nuisances(log: Recording, fit: Calibration, names: Sequence[str], index: int) -> Recording:
@@ -265,7 +265,7 @@ def _corrected(log: Recording, model: BiasModel | None, start: str) -> list[Imu]
         model = model or static.Model()
         if start == "smooth":
             return [apply(model, smooth_in_memory(model, log.imu, log.name), log.imu).imu]
-        truth_s = min(TRUTH_S, MOST_OF_LOG * float(seconds(log.imu.t_ns[-1:], int(log.imu.t_ns[0]))[0]))
+        truth_s = min(TRUTH_S, MAX_OF_LOG * float(seconds(log.imu.t_ns[-1:], int(log.imu.t_ns[0]))[0]))
         initial = find_initial_bias(f"truth:{truth_s}" if start == "truth" else start, model, log)
         return [apply(model, initial, log.imu).imu]
     except (DataError, ModelError):

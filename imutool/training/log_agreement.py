@@ -12,7 +12,7 @@ import torch
 
 from imutool.array_types import Float64
 from imutool.bias.model import COLUMNS
-from imutool.bias_start.prior_width import MOST_CHANGE, turned_axes
+from imutool.bias_start.prior_width import MAX_CHANGE, turned_axes
 from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.windows import HUBER_MEDIANS, huber_weight, rotation_residual
@@ -23,10 +23,10 @@ from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 
 CONTRADICTS = 0.35  # of the error without a matrix, left by a log's own: 30 s without any matrix keep 0.43 at least
-MOST_LEFT = (
+MAX_LEFT = (
     0.02  # share of chi-square that turned axes leave; of made-up sensors that turn on 10 to 20 mrad/s apart, 1 in 5000 has it
 )
-SMOOTHED_S, SLOPE_S, MOST_WINDOWS = 0.5, 0.04, 4000  # windows whose ends show smoothing, half the time of a slope, how many
+SMOOTHED_S, SLOPE_S, MAX_WINDOWS = 0.5, 0.04, 4000  # windows whose ends show smoothing, half the time of a slope, how many
 SURE, TOO_SMALL = 5.0, 0.03  # deviations, and share of a turn; of EuRoC, TUM-VI, FETCH, BROAD, RepoIMU and a car 0.025 at most
 ITERATIONS, RIDGE = 4, 1e-9  # of the weights; share of a square, for what the motion does not show
 LONG_ENOUGH_S = 40.0  # for a calibration of a log alone: shorter logs fit their noise
@@ -68,7 +68,7 @@ def check_axes(pool: Pool, fits: Mapping[Sensor, Calibration]) -> None:
     for log, name in enumerate(pool.names):
         others = np.delete(bias, log, axis=0)
         mean = np.median(others, axis=0)
-        for what in turned_axes(bias[log] - mean, np.hypot(std, others.std(axis=0)), mean, MOST_LEFT):
+        for what in turned_axes(bias[log] - mean, np.hypot(std, others.std(axis=0)), mean, MAX_LEFT):
             fix = "Turn its axes, or leave it out" if len(others) > 1 else "Turn the axes of one of the two"
             raise DataError(what, where=name, expected="the axes of the other logs", fix=fix)
     if len(pool.names) > 2:  # of two it could be either
@@ -80,7 +80,7 @@ def _name_other_units(names: Sequence[str], bias: Float64[np.ndarray, "logs 3"])
     usual = np.median(bias, axis=0)
     for name, own in zip(names, bias, strict=True):
         axis = int(np.argmax(np.abs(own - usual)))
-        if abs(own[axis] - usual[axis]) > MOST_CHANGE[axis]:
+        if abs(own[axis] - usual[axis]) > MAX_CHANGE[axis]:
             what = "%s: the gyro's bias about %s is %+.2g rad/s, the median of all logs %+.2g: another unit? %s"
             fix = "Train a model for each unit"
             logger.warning(what, name, "xyz"[axis], own[axis], usual[axis], fix)
@@ -107,24 +107,24 @@ def _smoothing(pool: Pool, log: int) -> tuple[float, float]:
     n, h = pool.samples(SMOOTHED_S), pool.samples(SLOPE_S)
     first = pool.starts(n, "all", hop=max(1, n // 2))
     first = first[pool.log[first] == log]
-    first = first[:: -(-len(first) // MOST_WINDOWS) or 1]
-    windows, one = pool.windows(first, n, pool.t.new_zeros(len(first), 6)), torch.eye(3).to(pool.t)
+    first = first[:: -(-len(first) // MAX_WINDOWS) or 1]
+    windows, eye = pool.windows(first, n, pool.t.new_zeros(len(first), 6)), torch.eye(3).to(pool.t)
     R = windows.R_start.mT @ windows.R_end
     e, turn = rotation_residual(windows.segment.gyro, windows.dt, R)[0], so3.log(R)
     steps, ends = torch.arange(-h, h + 1).to(pool.t), [pool.gyro[pool.around(end, h, h)] for end in (first, first + n)]
     slopes = [torch.einsum("k,mki->mi", steps * pool.rate_hz / (steps @ steps), rates) for rates in ends]
     changes = [at[1] - (R.mT @ at[0][..., None])[..., 0] for at in ([rates.mean(1) for rates in ends], slopes)]
-    by_matrix = torch.einsum("ij,mk->mijk", one, turn).flatten(2)
-    J = torch.cat([by_matrix, one.expand_as(R), R.mT - one, *(change[..., None] for change in changes)], dim=2)
-    left, x, H = e, J.new_zeros(J.shape[2]), J.new_zeros(J.shape[2], J.shape[2])
+    by_matrix = torch.einsum("ij,mk->mijk", eye, turn).flatten(2)
+    J = torch.cat([by_matrix, eye.expand_as(R), R.mT - eye, *(change[..., None] for change in changes)], dim=2)
+    residual, x, H = e, J.new_zeros(J.shape[2]), J.new_zeros(J.shape[2], J.shape[2])
     for _ in range(ITERATIONS if len(first) > J.shape[2] else 0):
-        size = left.norm(dim=1)
+        size = residual.norm(dim=1)
         weight = huber_weight(size, HUBER_MEDIANS * size.median().expand_as(size))
         H = torch.einsum("m,mij,mik->jk", weight, J, J)
         x = torch.linalg.solve(H + torch.diag(RIDGE * H.diagonal() + RIDGE**2), torch.einsum("m,mij,mi->j", weight, J, e))
-        left = e - J @ x
+        residual = e - J @ x
     missed = float(x[-1] - 0.5 * x[-2] ** 2)
-    std = float((torch.linalg.pinv(H)[-1, -1] * left.square().mean()).sqrt())
+    std = float((torch.linalg.pinv(H)[-1, -1] * residual.square().mean()).sqrt())
     share = missed * float(changes[1].norm() / turn.norm()) if missed > SURE * std else 0.0
     return math.sqrt(24.0 * max(missed, 0.0)), share
 

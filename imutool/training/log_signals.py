@@ -45,7 +45,7 @@ from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Pool
 from imutool.units import AXES, Sensor
 
-LEAST_PART_S = 60.0  # of each log, where all are too much
+MIN_PART_S = 60.0  # of each log, where all are too much
 TRIADS_RAD = 5e-3  # plausible rotation between the gyro and the accelerometer of one chip
 OFF_DIAGONAL, DIAGONAL = (1, 2, 3, 5, 6, 7), (0, 4, 8)  # of a 3x3 matrix, row by row
 COLD = 0  # index of the time zero
@@ -56,7 +56,7 @@ logger = logging.getLogger(__name__)
 
 
 def read_parts(
-    logs: Sequence[Path], most_samples: int, *, imu: str | None = None, truth: str | None = None
+    logs: Sequence[Path], max_samples: int, *, imu: str | None = None, truth: str | None = None
 ) -> list[tuple[Path, Recording]]:
     """Measurements of logs, and of each stretch of their clocks, of at most so many samples.
 
@@ -65,37 +65,37 @@ def read_parts(
     Raises:
         ConfigError, LogError, DataError: a log without IMU or measurements.
     """
-    left, parts, cut = list(logs), list[tuple[Path, Recording]](), set[Path]()
-    while left:
-        log = left.pop(0)
+    unread, parts, cut = list(logs), list[tuple[Path, Recording]](), set[Path]()
+    while unread:
+        log = unread.pop(0)
         parts += [(log, measured_recording(part)) for part in read_stretches(log, imu=imu, truth=truth)]
-        most = _most_of_each(parts, most_samples)
-        while most * parts[0][1].imu.period_s < LEAST_PART_S and len(parts) > 1:
-            left, parts = left[len(parts) % 2 :: 2], parts[::2]
-            most = _most_of_each(parts, most_samples)
+        maximum = _max_of_each(parts, max_samples)
+        while maximum * parts[0][1].imu.period_s < MIN_PART_S and len(parts) > 1:
+            unread, parts = unread[len(parts) % 2 :: 2], parts[::2]
+            maximum = _max_of_each(parts, max_samples)
         for k, (path, part) in enumerate(parts):
-            if len(part.imu) > most:
-                first = part.between(int(part.imu.t_ns[0]), int(part.imu.t_ns[most - 1]))
+            if len(part.imu) > maximum:
+                first = part.between(int(part.imu.t_ns[0]), int(part.imu.t_ns[maximum - 1]))
                 parts[k] = path, copy.deepcopy(first)  # without the rest in memory
                 cut.add(path)
     used = {path: part.imu.duration_s for path, part in parts}
-    told = [f"only {len(used)} of {len(logs)} logs are used"] * (len(used) < len(set(logs)))
+    remarks = [f"only {len(used)} of {len(logs)} logs are used"] * (len(used) < len(set(logs)))
     if shorter := [used[path] for path in cut & used.keys()]:
-        told.append(f"only the first {max(shorter):.0f} s of long logs")
-    if told:
-        logger.warning("%s: a sample takes 3 kB of memory; --set most_samples=N takes more", ", and ".join(told))
+        remarks.append(f"only the first {max(shorter):.0f} s of long logs")
+    if remarks:
+        logger.warning("%s: a sample takes 3 kB of memory; --set most_samples=N takes more", ", and ".join(remarks))
     return parts
 
 
-def _most_of_each(parts: Sequence[tuple[Path, Recording]], most: int) -> int:
-    """Number of samples to which longer parts have to be cut for a sum of at most `most`."""
-    left = most
+def _max_of_each(parts: Sequence[tuple[Path, Recording]], maximum: int) -> int:
+    """Number of samples to which longer parts have to be cut for a sum of at most `maximum`."""
+    remaining = maximum
     for k, count in enumerate(sorted(len(part.imu) for _, part in parts)):
-        level = left // (len(parts) - k)
+        level = remaining // (len(parts) - k)
         if count > level:
             return level
-        left -= count
-    return most
+        remaining -= count
+    return maximum
 
 
 def turned_alike(

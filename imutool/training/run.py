@@ -31,10 +31,10 @@ from imutool.recording import Recording
 from imutool.training import checkpoint
 from imutool.training.calibration.effect_selection import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
 from imutool.training.calibration.filter_settings import filter_settings
-from imutool.training.calibration.log_scatter import LEAST_GAIN, SURELY
+from imutool.training.calibration.log_scatter import MIN_GAIN, SURELY
 from imutool.training.candidates import left_out_covariance, simpler_effects
 from imutool.training.fit import Epoch, Training, check_device, note
-from imutool.training.left_out import LEAST_ERROR, beaten, compare
+from imutool.training.left_out import MIN_ERROR, beaten, compare
 from imutool.training.log_agreement import warn_of_smoothed_poses
 from imutool.training.log_signals import matrix_covariance, read_parts, with_poses_of_sensor
 from imutool.training.objectives.paper_scheme import PaperTraining
@@ -93,7 +93,7 @@ def train(
         raise ConfigError(f"{method} has no steps to go on with", where="resume", fix="Train it without `resume`")
     if method == hybrid.Model.method:
         config_of(chosen)  # a misspelt setting is an error before any log is read
-    parts = read_parts(logs, chosen.most_samples, imu=imu, truth=truth)
+    parts = read_parts(logs, chosen.max_samples, imu=imu, truth=truth)
     check_conventions(part for _, part in parts)
     recordings = [within_range(part) for _, part in parts]
     for recording in (recording for recording in recordings if recording.truth_caveat):
@@ -223,7 +223,7 @@ def _drift_first(
 def helps(before: LogErrors, after: LogErrors) -> bool:
     """Whether a descent lowers a sensor's errors beyond the scatter of logs, and harms none."""
     harm = max(float(np.mean(after[sensor] - before[sensor])) for sensor in before)
-    return harm < LEAST_GAIN and any(beaten(before[sensor], after[sensor], SURELY) for sensor in before)
+    return harm < MIN_GAIN and any(beaten(before[sensor], after[sensor], SURELY) for sensor in before)
 
 
 def _log_errors(training: Training) -> LogErrors:
@@ -231,7 +231,7 @@ def _log_errors(training: Training) -> LogErrors:
 
     def of_logs(errors: Tensor, log: Tensor) -> Float64[np.ndarray, " logs"]:
         means = [float(errors[log == index].mean()) for index in range(len(training.pool.names))]
-        return np.log(np.maximum(means, LEAST_ERROR))
+        return np.log(np.maximum(means, MIN_ERROR))
 
     return {sensor: of_logs(*training.held_out_errors(sensor, training.model)) for sensor in training.done}
 
@@ -273,8 +273,8 @@ TRAINERS: dict[str, Trainer] = {"hybrid": _physics_first, "linear": _linear, "ne
 
 def _shared(recordings: Sequence[Recording], key: str) -> str | None:
     """What all logs say of themselves under a key, if they agree."""
-    said = {recording.metadata.get("imutool", {}).get(key) for recording in recordings}
-    return said.pop() if len(said) == 1 else None
+    values = {recording.metadata.get("imutool", {}).get(key) for recording in recordings}
+    return values.pop() if len(values) == 1 else None
 
 
 def _held_out(training: Training) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from imutool.units import SENSORS, Sensor
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
-LEAST_RESIDUAL = 1e-6  # rad or m/s: no truth is better, and perfect data must not outweigh the prior beyond float64's digits
+MIN_RESIDUAL = 1e-6  # rad or m/s: no truth is better, and perfect data must not outweigh the prior beyond float64's digits
 
 
 class IncrementSettings(Settings, frozen=True):
@@ -67,7 +67,7 @@ class PoseFloors(Settings, frozen=True):
     def of(self, kind: str) -> tuple[float, float]:
         """Least residuals of gyro (rad) and accel (m/s); of a truth and of poses of unknown kind almost none."""
         known = {"estimate": (self.estimate_rad, self.estimate_m_s), "odometry": (self.odometry_rad, self.odometry_m_s)}
-        return known.get(kind, (LEAST_RESIDUAL, LEAST_RESIDUAL))
+        return known.get(kind, (MIN_RESIDUAL, MIN_RESIDUAL))
 
 
 class SensorPrior(Settings, frozen=True):
@@ -112,7 +112,7 @@ class TrainSettings(Settings, frozen=True):
     weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-4  # of AdamW
     track_knot_s: Positive = 20.0  # between knots of each log's own slow bias, which the training estimates beside the weights
     validate_every: Count = 100  # steps between two lines of progress, each with a checkpoint
-    most_samples: Count = 1_000_000  # of all logs together, each from its start: one takes 3 kB of memory
+    max_samples: Count = 1_000_000  # of all logs together, each from its start: one takes 3 kB of memory
     compare: bool = True  # linear and hybrid: score left-out logs, and keep the simplest model that is not beaten
     increments: IncrementSettings = IncrementSettings()
     paper: PaperSettings = PaperSettings()

@@ -31,8 +31,8 @@ from imutool.units import SENSORS, Sensor
 HELD_OUT = 0.2  # the last fifth of every training log validates, as in the paper
 MAX_RATE_SPREAD = 0.05
 
-LEAST_S = 10.0  # of truth without gaps, in all logs together
-LEAST_TURN_RAD_S = 0.02  # of the rate about its own mean, over a second: less is a sensor on a table
+MIN_S = 10.0  # of truth without gaps, in all logs together
+MIN_TURN_RAD_S = 0.02  # of the rate about its own mean, over a second: less is a sensor on a table
 TURNING = 0.9  # share of the seconds in which a car on a straight road, or a robot that waits, may turn by less
 WINDOW_S = 1.0
 WORST_MISS = 0.2  # of a log's largest turns; EuRoC, TUM-VI, FETCH and BROAD miss by at most 3 %, inverse quaternions by 40 %
@@ -136,7 +136,7 @@ class Pool:
         """The samples of a sensor."""
         return self.gyro if sensor == "gyro" else self.accel
 
-    def least(self, sensor: Sensor) -> Float[Tensor, " logs"]:
+    def minimum(self, sensor: Sensor) -> Float[Tensor, " logs"]:
         """Least residual of each log's windows."""
         return self.floors[:, SENSORS.index(sensor)]
 
@@ -234,12 +234,12 @@ def without_motion(model: BiasNetwork, pool: Pool) -> Pool:
     As `imutool.bias_start.bias_tracking` takes it off.
     """
     inference, samples = model.frozen(), torch.cat([pool.gyro, pool.accel], dim=1)
-    start, left = inference.prior_mean, samples.clone()
+    start, residual = inference.prior_mean, samples.clone()
     for log in range(len(pool.names)):
         rows = pool.log == log
         t_s, u = (x[rows].cpu().double().numpy() for x in (pool.t, samples))
-        left[rows] -= torch.from_numpy(inference.stream(start)(t_s, u[:, :3], u[:, 3:]) - start).to(left)
-    return replace(pool, gyro=left[:, :3].clone(), accel=left[:, 3:].clone())
+        residual[rows] -= torch.from_numpy(inference.stream(start)(t_s, u[:, :3], u[:, 3:]) - start).to(residual)
+    return replace(pool, gyro=residual[:, :3].clone(), accel=residual[:, 3:].clone())
 
 
 def sensors_up_to(sensor: Sensor) -> tuple[Sensor, ...]:
@@ -259,18 +259,18 @@ def check_trainable(recordings: Sequence[Recording], pool: Pool) -> None:
     check_one_sensor(recordings)
     n = pool.samples(WINDOW_S)
     first = pool.starts(n, "all", hop=n)
-    if len(first) * WINDOW_S < LEAST_S:
+    if len(first) * WINDOW_S < MIN_S:
         raise DataError(
             f"{len(first) * WINDOW_S:.0f} s of truth without gaps in all training logs",
             where=", ".join(pool.names),
-            expected=f"at least {LEAST_S:g} s, and minutes for a useful model",
+            expected=f"at least {MIN_S:g} s, and minutes for a useful model",
             fix="Add logs, or look at their truth with imutool info",
         )
     rates = pool.gyro[first[:, None] + torch.arange(n)].mean(1)  # noise is no motion
     turning = float((rates - rates.mean(0)).norm(dim=1).quantile(TURNING))
-    if turning < LEAST_TURN_RAD_S:
+    if turning < MIN_TURN_RAD_S:
         what = f"the sensor stands still: {TURNING:.0%} of the time it turns by less than {turning:.3f} rad/s"
-        expected = f"motion, more than {LEAST_TURN_RAD_S:g} rad/s"
+        expected = f"motion, more than {MIN_TURN_RAD_S:g} rad/s"
         fix = "Add logs in which it turns; for a sensor at rest, imutool debias needs no model"
         raise DataError(what, where=", ".join(pool.names), expected=expected, fix=fix)
     _truths_follow(pool, first, n)
@@ -289,7 +289,7 @@ def _truths_follow(pool: Pool, first: Tensor, n: int) -> None:
             continue
         missed = float((e[of_log] - e[of_log].median(0).values).norm(dim=1).median())
         largest = float(turned[of_log].quantile(0.9))
-        if missed > WORST_MISS * max(largest, LEAST_TURN_RAD_S * WINDOW_S):
+        if missed > WORST_MISS * max(largest, MIN_TURN_RAD_S * WINDOW_S):
             wrong[name] = f"{missed:.2f} rad a second, of {largest:.2f}"
     if wrong:
         raise DataError(

@@ -87,7 +87,7 @@ def vio(
     check_conventions([recording])
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
-    course = plan(recording, chosen)
+    problem = plan(recording, chosen)
     total = (1 + len(models)) * len(bias_states)
     results: list[dict[str, Any]] = []
     for name, debiased, start in runs(recording, models, init, log):
@@ -100,9 +100,9 @@ def vio(
                     "init": init if start else None,
                     "init_how": start.how if start else None,
                     "bias_states": states,
-                    **score(debiased.imu, course, chosen, bias_states=states, progress=tell),
+                    **score(debiased.imu, problem, chosen, bias_states=states, progress=tell),
                     "camera": camera.EUROC.name,
-                    "tracks": round(camera.seen(course.frames), 1),
+                    "tracks": round(camera.seen(problem.frames), 1),
                     "settings": msgspec.to_builtins(chosen),
                 }
             )
@@ -148,7 +148,7 @@ def plan(recording: Recording, settings: VioSettings) -> VioProblem:
 
 def score(
     imu: Imu,
-    course: VioProblem,
+    problem: VioProblem,
     settings: VioSettings,
     *,
     bias_states: bool,
@@ -159,19 +159,19 @@ def score(
     They are those of `imutool.inertial.metrics`, aligned in heading and position at the first keyframe.
     """
     began = time.process_time()
-    start = StartPose.of(course.true)
+    start = StartPose.of(problem.true)
     try:
         estimate = smoother.estimate(
-            imu.rows(course.rows),
-            course.keyframes,
-            course.frames,
+            imu.rows(problem.rows),
+            problem.keyframes,
+            problem.frames,
             start,
             settings.smoother,
             pixel_std=settings.pixel_noise,
             bias_states=bias_states,
             progress=progress,
         )
-        figures = metrics.evaluate(from_first_pose(estimate.poses, course.true), course.true, course.valid)
+        figures = metrics.evaluate(from_first_pose(estimate.poses, problem.true), problem.true, problem.valid)
     except NumericsError as error:
         return {"failed": str(error), **dict.fromkeys(FIGURES), "cpu_s": time.process_time() - began}
     bias = {"gyro_bias_end": estimate.bias[-1, :3].tolist(), "accel_bias_end": estimate.bias[-1, 3:].tolist()}

@@ -32,7 +32,7 @@ Positive = Annotated[float, Meta(gt=0.0)]
 INTEGRATION_STD = 1e-4  # m/sqrt(Hz), of the position within a step: what the rule of the mean leaves
 FIXED_BIAS_STD = 1e-5  # rad/s and m/s²: a bias that is no state is zero this surely
 LANDMARK_STD_M = 100.0  # weak, about its first place: a point that falls behind the camera leaves no hole in the system
-LEAST_DISPARITY_PX = 1.0  # a first place is no further away than this, whatever the noise
+MIN_DISPARITY_PX = 1.0  # a first place is no further away than this, whatever the noise
 
 
 class SmootherSettings(config.Settings, frozen=True, kw_only=True):
@@ -213,7 +213,7 @@ class _Run:
         gtsam, pose = self._gtsam, self._keys(self._k)[0]
         camera = self._state.pose().compose(self._body_from_camera)
         nearest = frame.pixels.copy()
-        nearest[:, 1] = np.minimum(nearest[:, 1], nearest[:, 0] - LEAST_DISPARITY_PX)
+        nearest[:, 1] = np.minimum(nearest[:, 1], nearest[:, 0] - MIN_DISPARITY_PX)
         places_c = EUROC.back_project(nearest)
         for track, pixels, place_c in zip(frame.tracks.tolist(), frame.pixels, places_c, strict=True):
             key = gtsam.symbol("l", track)

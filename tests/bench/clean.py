@@ -112,13 +112,13 @@ def main() -> None:
             log = Path(folder) / "long.mcap"
             samples = write_long(log, minutes)
             found = {what: [run(what, log) for _ in range(options.rounds)] for what in ("read", "survey", "info")}
-            least = {what: min(one["cpu_s"] for one in rounds) for what, rounds in found.items()}
+            minimum = {what: min(one["cpu_s"] for one in rounds) for what, rounds in found.items()}
             for what, rounds in found.items():
                 memory = min(one["more_mb"] for one in rounds)
-                ratio = least[what] / least["read"]
+                ratio = minimum[what] / minimum["read"]
                 print(
-                    f"{minutes:6.0f} min  {what:6}  {least[what]:7.2f} s CPU  {ratio:5.1f} x read  "
-                    f"{samples / least[what] / 1e3:7.0f} k samples/s  {memory:6.0f} MB more"
+                    f"{minutes:6.0f} min  {what:6}  {minimum[what]:7.2f} s CPU  {ratio:5.1f} x read  "
+                    f"{samples / minimum[what] / 1e3:7.0f} k samples/s  {memory:6.0f} MB more"
                 )
             log.unlink()
 

@@ -31,7 +31,7 @@ VIEWERS = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "supp
 
 SIZE = (1280, 720)
 COLORS = 256
-LEAST = 300  # pixels of a curve in a viewer that has drawn it
+MIN = 300  # pixels of a curve in a viewer that has drawn it
 TABS = ("Signals", "Bias", "Spectrum", "Errors", "Events", "Report")
 TOLD_S = 10.0  # for which a viewer tells of itself in a corner
 
@@ -84,7 +84,7 @@ def paper(browser: Any, page_path: Path, scheme: str) -> Any:
 
 def draws(picture: Any) -> bool:
     """Whether the errors of both paths are drawn, which are beside every tab. The viewer itself has blue."""
-    return min(VIEWERS.drawn(picture, color) for color in (RAW_COLOR, MODEL_COLORS[0])) >= LEAST
+    return min(VIEWERS.drawn(picture, color) for color in (RAW_COLOR, MODEL_COLORS[0])) >= MIN
 
 
 def save(picture: Any, path: Path) -> None:

@@ -110,8 +110,8 @@ def arms_mm(recording: Recording) -> Iterator[str]:
     settings = DiagnoseSettings()
     pairs = [without_unusable(pair, settings.reference) for pair in align(recording, None, None, settings)]
     candidates, trusting = candidates_for(pairs), msgspec.structs.replace(settings.band, diluted_share=1.0)
-    for most_hz, band in (*((hz, trusting) for hz in ARM_BANDS_HZ), (np.inf, settings.band)):
-        limited = [replace(pair, band_hz=min(pair.band_hz or most_hz, most_hz)) for pair in pairs]
+    for max_hz, band in (*((hz, trusting) for hz in ARM_BANDS_HZ), (np.inf, settings.band)):
+        limited = [replace(pair, band_hz=min(pair.band_hz or max_hz, max_hz)) for pair in pairs]
         logs = [whitened(pair, candidates, band) for pair in limited]
         left_in = (*EVERY_UNIT, "clock_wander", "reference_smoothing")
         chosen = tuple((one, one.null_value.astype(float)) for one in candidates if one.name in left_in)
@@ -155,7 +155,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.by_frequency:
         head = ["log", *(f"positions late, {slow:g}–{fast:g} Hz (ms)" for slow, fast in LAG_BANDS_HZ)]
-        head += [f"arm z up to {most_hz:g} Hz (mm)" for most_hz in ARM_BANDS_HZ]
+        head += [f"arm z up to {max_hz:g} Hz (mm)" for max_hz in ARM_BANDS_HZ]
         head += ["as diagnosed"]
         print(markdown(head, (row_by_frequency(log, options.truth) for log in options.logs)))
         return

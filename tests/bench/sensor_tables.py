@@ -15,7 +15,7 @@ import numpy as np
 
 SHOWN_IN = {"-": ("%", 1e2), "m": ("mm", 1e3), "s": ("ms", 1e3), "rad": ("mrad", 1e3)}  # by unit: what a table shows
 UNSEEN = 4.0  # times the plausible size: a number that no motion showed
-MOST, ALL = 0.5, 1.0  # of the sequences
+MAX, ALL = 0.5, 1.0  # of the sequences
 COLORS = ("#c23b3b", "#2f8f4e", "#2f62b5")  # x, y, z
 PICTURED = ("gyro_scale", "accel_scale", "lever_arm", "clock_offset")
 
@@ -72,13 +72,13 @@ def how_often(count: int, of: int) -> str:
     """All, most, some or one of the sequences."""
     if count == of:
         return "all"
-    return "most" if count > MOST * of else "one" if count == 1 else "some"
+    return "most" if count > MAX * of else "one" if count == 1 else "some"
 
 
 def agreed(found: Mapping[str, Iterable[str]], lasting: Iterable[str]) -> tuple[str, ...]:
     """Effects, of those that last from one recording to the next, that came up in at least half the sequences."""
     effects = [set(names) for names in found.values()]
-    return tuple(name for name in sorted(lasting) if sum(name in names for names in effects) >= MOST * len(effects))
+    return tuple(name for name in sorted(lasting) if sum(name in names for names in effects) >= MAX * len(effects))
 
 
 # ── tables ──

@@ -18,7 +18,7 @@ from imutool.bias.model_file import header_of
 
 PREFIX = {"euroc": "euroc-adis16448", "tumvi": "tum_vi-bmi160", "fetch": "fetch"}
 METHODS = ("linear", "conv", "neural_ode", "hybrid")
-MOST_BYTES = 2_000_000
+MAX_BYTES = 2_000_000
 COMMAND = "imutool train {logs} -o {name}.safetensors --method {method} --seed {seed}"
 LIMITS = (
     "This is the calibration of one unit: another sensor of the same type has another scale, misalignment and turn-on bias. It "
@@ -36,8 +36,8 @@ def main() -> None:
                 continue
             best = min(found, key=lambda path: float(header_of(path)["held_out"]["gyro"]["error"]))
             name = f"{prefix}-{method}"
-            if best.stat().st_size > MOST_BYTES:
-                raise SystemExit(f"{best} has {best.stat().st_size} bytes, more than {MOST_BYTES}")
+            if best.stat().st_size > MAX_BYTES:
+                raise SystemExit(f"{best} has {best.stat().st_size} bytes, more than {MAX_BYTES}")
             shutil.copyfile(best, target / f"{name}.safetensors")
             rows = [row for path in found for row in json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))]
             (target / f"{name}.md").write_text(card(name, header_of(best), rows, len(found)), encoding="utf-8")

@@ -106,8 +106,8 @@ def applied(model: Unit, unit: Unit) -> list[tuple[str, Path]]:
 def judged(model: Unit, path: Path) -> tuple[bool, str]:
     """Whether a model does harm to a log, and its verdict."""
     raw, static, corrected = evaluate(path, models=["static", str(model.model)])
-    least = min(raw["aoe_deg"], static["aoe_deg"])
-    return corrected["aoe_deg"] > max(HARM * least, HARM_DEG + least), corrected["fit"]["verdict"]
+    minimum = min(raw["aoe_deg"], static["aoe_deg"])
+    return corrected["aoe_deg"] > max(HARM * minimum, HARM_DEG + minimum), corrected["fit"]["verdict"]
 
 
 if __name__ == "__main__":

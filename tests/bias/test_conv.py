@@ -18,7 +18,7 @@ from imutool.array_types import Float64
 from imutool.bias.conv import BLOCK, Config
 from imutool.bias.model import COLUMNS
 from imutool.bias.model_file import load, save
-from imutool.bias.networks.conv import LEAST_SCALE, Layer, Net, Network
+from imutool.bias.networks.conv import MIN_SCALE, Layer, Net, Network
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.neural_stream import gelu
 from imutool.errors import ConfigError
@@ -122,7 +122,7 @@ def test_it_takes_mean_and_spread_from_what_it_sees(segment: MakeSegment) -> Non
         net = part(model, sensor)
         torch.testing.assert_close(net.centre[:3], gyro.mean(0), rtol=1e-6, atol=0)
         torch.testing.assert_close(net.scale[3:], seen.accel[0].std(0), rtol=1e-6, atol=0)
-        assert net.scale[1] == pytest.approx(LEAST_SCALE[1])
+        assert net.scale[1] == pytest.approx(MIN_SCALE[1])
 
 
 def test_dropout_and_batch_statistics_are_trainings_alone(model: Network, segment: MakeSegment) -> None:

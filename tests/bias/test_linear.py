@@ -16,7 +16,7 @@ from imutool.training.training_windows import Pool
 from imutool.units import SENSORS, Sensor
 
 SETS, LOGS = 8, 4  # sets of logs
-LEAST = 0.4  # the size stated before the scatter counts, too, and is too large for poses with independent errors
+MIN = 0.4  # the size stated before the scatter counts, too, and is too large for poses with independent errors
 KIND = Switchings(rest_s=2.0, duration_s=20.0, rate_hz=50.0, mount_rad=0.0, clock_s=0.0, scale=0.01)
 
 
@@ -56,4 +56,4 @@ def test_matrices_of_different_logs_differ_as_their_covariance_says(sensor: Sens
         solutions.append(closed_form.solve(StaticNetwork().double(), sensor, pool, rest, (1.0, 4.0), matrix=True, part="all"))
     W = torch.stack([solution.W.flatten() for solution in solutions])
     squares = [float(d @ torch.linalg.solve(s.covariance, d)) / 9 for d, s in zip(W - W.mean(0), solutions, strict=True)]
-    assert LEAST < np.mean(squares) * SETS / (SETS - 1) < 1.0
+    assert MIN < np.mean(squares) * SETS / (SETS - 1) < 1.0

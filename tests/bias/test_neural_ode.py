@@ -32,7 +32,7 @@ SECONDS = 12.0
 SHARE = 0.06  # between a step and its half; to no step at all it is twice as far
 SAME_CURVE = 1e-13  # rad/s, m/s²: sums of 16 terms in another order
 ORDER = 0.3  # design.md: measured order of convergence within 0.3 of theory
-LEAST = {"gyro": 5e-4, "accel": 5e-3}  # rad/s, m/s²: the drift over 12 s with these weights, else there is nothing to compare
+MIN = {"gyro": 5e-4, "accel": 5e-3}  # rad/s, m/s²: the drift over 12 s with these weights, else there is nothing to compare
 MakeModel, MakeSegment = Callable[..., BiasNetwork], Callable[..., Segment]
 
 
@@ -75,8 +75,8 @@ def seen() -> Segment:
 @pytest.fixture(scope="module")
 def reference(build: MakeModel, seen: Segment) -> dict[str, Tensor]:
     path = rest_path(lively(build), seen)
-    for sensor, least in LEAST.items():
-        assert largest(path[sensor]) > least, sensor
+    for sensor, minimum in MIN.items():
+        assert largest(path[sensor]) > minimum, sensor
     return path
 
 
@@ -84,7 +84,7 @@ def test_at_half_the_step_the_drift_is_the_same_and_what_is_left_halves(
     build: MakeModel, seen: Segment, reference: dict[str, Tensor]
 ) -> None:
     paths = [reference, *(rest_path(lively(build, drift_step_s=step_s), seen) for step_s in (0.125, 0.0625, 0.03125))]
-    for sensor in LEAST:
+    for sensor in MIN:
         apart = [a[sensor] - b[sensor] for a, b in pairwise(paths)]
         assert largest(apart[0]) < SHARE * largest(reference[sensor]), sensor
         left = [float(change.square().mean().sqrt()) for change in apart]  # the largest of 4800 is too noisy for an order
@@ -95,7 +95,7 @@ def test_at_half_the_step_the_drift_is_the_same_and_what_is_left_halves(
 def test_with_another_solver_the_drift_is_the_same(build: MakeModel, seen: Segment, reference: dict[str, Tensor]) -> None:
     """And rk4 and dopri5 agree closer: the path has a kink at every knot, on which rk4 stops and dopri5 does not."""
     rk4, dopri5 = (rest_path(lively(build, solver=solver), seen) for solver in ("rk4", "dopri5"))
-    for sensor in LEAST:
+    for sensor in MIN:
         size = largest(reference[sensor])
         assert largest(rk4[sensor] - reference[sensor]) < 2 * SHARE * size, sensor
         assert largest(dopri5[sensor] - reference[sensor]) < 2 * SHARE * size, sensor

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from imutool.bias.model_file import find_model
-from imutool.bias.physics import MOST_TAU_S, Model
+from imutool.bias.physics import MAX_TAU_S, Model
 from imutool.bias_start.correction import OnlineDebiaser, apply
 from imutool.bias_start.initial_bias import prior
 from imutool.debiasing import debias
@@ -160,7 +160,7 @@ def test_the_bias_is_the_prior_and_the_deviations_its_calibration(trajectory: Pa
 
 def test_what_cannot_be_taken_off_is_told(trajectory: Path, caplog: pytest.LogCaptureFixture) -> None:
     limit = entry("saturation", {"gyro_limit": 5.0})
-    late = entry("clock_offset", {"tau": 2.0 * MOST_TAU_S})
+    late = entry("clock_offset", {"tau": 2.0 * MAX_TAU_S})
     turned = entry("mount_rotation", {"phi_x": 0.1})
     sets_in = entry("accel_scale", {"x": 0.1, "t_step": 20.0})
     file = written(trajectory.with_name("some.toml"), limit, late, turned, entry("gyro_scale", {"x": 0.1}), sets_in)

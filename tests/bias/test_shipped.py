@@ -18,7 +18,7 @@ from imutool.evaluation import evaluate
 from imutool.mcap_io.log import Log
 
 MODELS = sorted(library().glob("*.safetensors"))
-MOST_BYTES = 2_000_000
+MAX_BYTES = 2_000_000
 SENSORS = {"euroc": "adis16448", "tum_vi": "bmi160", "fetch": "fetch"}
 # The published figure of the neural ODE; ours was 1.07 ± 0.11 over five seeds when the model was trained.
 PUBLISHED_FETCH_DEG = 1.96
@@ -62,7 +62,7 @@ def test_an_online_debiaser_goes_to_another_process_in_the_middle_of_a_stream(pa
 @pytest.mark.parametrize("path", MODELS, ids=lambda path: path.stem)
 def test_a_model_that_ships_is_whole(path: Path) -> None:
     about, model = header_of(path), load(path)
-    assert path.stat().st_size < MOST_BYTES
+    assert path.stat().st_size < MAX_BYTES
     assert about["sensor"] == SENSORS[about["dataset"]]
     assert path.stem.endswith(model.method)
     assert (model.prior_std > 0).all()

@@ -118,13 +118,13 @@ def test_it_is_as_sure_as_it_should_be(filtered: Filtered, still_s: float, way: 
 def test_a_state_of_a_wide_prior_becomes_that_of_the_width_that_the_log_supports() -> None:
     """As if the filter had begun with it: `supported` and a second run agree, but for the change of the linearization."""
     imu = biased(3)
-    wide = replace(KNOWN, std=3.0 * KNOWN.std, least=LeastWidth(0.1 * KNOWN.std))
+    wide = replace(KNOWN, std=3.0 * KNOWN.std, minimum=LeastWidth(0.1 * KNOWN.std))
     last = forward(imu, wide)[-1]
     state = last.step.after
     (found, _), (P, _) = wide.supported([state] * 2, np.full(2, last.end_s), np.array([False, True]))
     walked = wide.walk**2 * last.end_s
     shown = shown_bias(state.bias, np.diag(state.covariance(False)), wide.mean, wide.std**2 + walked)
-    again = forward(imu, replace(wide, std=supported_std(wide.std, wide.least, *shown), least=None))[-1].step.after
+    again = forward(imu, replace(wide, std=supported_std(wide.std, wide.minimum, *shown), minimum=None))[-1].step.after
     std = np.sqrt(np.diag(again.covariance(False)))
     wider = np.sqrt(np.diag(P)) / std
     assert ((wider > 0.95) & (wider < 1.5)).all(), "nor is it known that this is the width"
@@ -134,7 +134,7 @@ def test_a_state_of_a_wide_prior_becomes_that_of_the_width_that_the_log_supports
 
 def test_a_width_that_the_log_does_not_show_is_counted() -> None:
     """Widths evenly spread in their logarithm: before the log shows anything, the variance is the mean of their squares."""
-    prior = replace(KNOWN, std=np.full(6, 1e-2), least=LeastWidth(np.full(6, 1e-3)))
+    prior = replace(KNOWN, std=np.full(6, 1e-2), minimum=LeastWidth(np.full(6, 1e-3)))
     first = forward(biased(3, still_s=0.0), prior)[0]
     blind = replace(first.step.after, P=np.diag([1.0] * 9 + [1e-4] * 6 + [1e-6] * 6))
     _, (P,) = prior.supported([blind], np.zeros(1), np.array([False]))

@@ -105,14 +105,14 @@ def test_a_live_node_says_since_when_the_sensor_is_on(tmp_path: Path) -> None:
 def test_the_first_two_seconds_of_a_live_stream_tell() -> None:
     """At rest; the same sensor without a warm-up is one that is warm."""
     model, size = warming(), np.abs(warming().tensors["theta_gyro"]).max()
-    for kind, least, most in (("warm_up", 0.4, 0.7), ("none", 0.0, 0.1)):
+    for kind, minimum, maximum in (("warm_up", 0.4, 0.7), ("none", 0.0, 0.1)):
         imu = log(50, replace(SENSOR, kind=kind), 20.0).imu
         blocks: list[DebiasedBlock] = []
         rows = zip(imu.t_ns.tolist(), imu.gyro.tolist(), imu.accel.tolist(), strict=True)
         stream = (Sample(t_ns, tuple(gyro), tuple(accel), 0.0) for t_ns, gyro, accel in rows)
         run(stream, model, Malformed(), show=blocks.append)
         moved = np.ptp(np.concatenate([block.bias[:, :3] for block in blocks]), axis=0).max() / size
-        assert least < moved < most, kind
+        assert minimum < moved < maximum, kind
 
 
 def test_a_model_without_drift_and_a_log_without_samples_are_left_alone() -> None:

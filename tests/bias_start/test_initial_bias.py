@@ -254,8 +254,8 @@ def test_what_the_gyro_does_not_show_is_no_bias(biased: Recording, what: str) ->
     near = np.abs(t - t[fast]) < 0.5
     imu, truth = biased.imu, biased.truth
     if what == "clipped":
-        most = 0.7 * np.abs(imu.gyro[:, 0]).max()
-        imu = Imu(imu.t_ns, np.column_stack([imu.gyro[:, 0].clip(-most, most), imu.gyro[:, 1:]]), imu.accel)
+        maximum = 0.7 * np.abs(imu.gyro[:, 0]).max()
+        imu = Imu(imu.t_ns, np.column_stack([imu.gyro[:, 0].clip(-maximum, maximum), imu.gyro[:, 1:]]), imu.accel)
     elif what == "lost":
         imu = imu.rows(~near)
     else:
@@ -526,16 +526,18 @@ def test_a_prior_that_the_log_contradicts_gives_way_and_one_that_it_bears_out_st
 
 
 def test_two_axes_that_repeat_speak_for_the_third_and_a_large_change_is_believed() -> None:
-    least, most = LeastWidth(np.array([5e-4] * 3 + [0.02] * 3)), np.array([7e-3] * 3 + [0.15] * 3)
+    minimum, maximum = LeastWidth(np.array([5e-4] * 3 + [0.02] * 3)), np.array([7e-3] * 3 + [0.15] * 3)
     variance = np.array([4e-4, 4e-4, 5e-3] + [np.inf] * 3) ** 2
-    repeats = supported_std(most, least, np.array([3e-4, -2e-4, -7e-3, 0.0, 0.0, 0.0]), variance)
-    assert (repeats[:3] < 2 * least.std[:3]).all(), "the third axis shows 7 mrad/s with a deviation of 5"
-    np.testing.assert_allclose(repeats[3:], np.sqrt(least.std * most)[3:]), "nothing is shown of the accelerometer: the middle"
-    changed = supported_std(most, least, np.array([6e-3, -8e-3, -7e-3, 0.0, 0.0, 0.0]), variance)
-    assert (changed[:3] > 0.6 * most[:3]).all()
-    np.testing.assert_array_equal(supported_std(most, None, np.zeros(6), variance), most)
-    same = supported_std(most, least._replace(probability=1.0), np.array([6e-3, -8e-3, -7e-3, 0.0, 0.0, 0.0]), variance)
-    np.testing.assert_allclose(same[3:], least.std[3:])
+    repeats = supported_std(maximum, minimum, np.array([3e-4, -2e-4, -7e-3, 0.0, 0.0, 0.0]), variance)
+    assert (repeats[:3] < 2 * minimum.std[:3]).all(), "the third axis shows 7 mrad/s with a deviation of 5"
+    np.testing.assert_allclose(
+        repeats[3:], np.sqrt(minimum.std * maximum)[3:]
+    )  # nothing shown of the accelerometer: the middle
+    changed = supported_std(maximum, minimum, np.array([6e-3, -8e-3, -7e-3, 0.0, 0.0, 0.0]), variance)
+    assert (changed[:3] > 0.6 * maximum[:3]).all()
+    np.testing.assert_array_equal(supported_std(maximum, None, np.zeros(6), variance), maximum)
+    same = supported_std(maximum, minimum._replace(probability=1.0), np.array([6e-3, -8e-3, -7e-3, 0.0, 0.0, 0.0]), variance)
+    np.testing.assert_allclose(same[3:], minimum.std[3:])
 
 
 @pytest.mark.parametrize("start", ["auto", "stationary", "smooth"])
@@ -566,10 +568,10 @@ def test_a_log_of_a_session_that_training_saw_starts_from_its_prior() -> None:
     assert prior(made, 128 * hour).rest[0] == 0.2
     assert prior(made, 115 * hour).rest[0] == pytest.approx(0.3)
     np.testing.assert_array_equal(bias_prior(made, 104 * hour).std, [0.2] * 6)  # it may have been switched on again
-    least = bias_prior(made, 104 * hour).least
-    assert least is not None
-    np.testing.assert_array_equal(least.std, [1e-3] * 6)
-    assert 0.0 < least.probability < 1.0
+    minimum = bias_prior(made, 104 * hour).minimum
+    assert minimum is not None
+    np.testing.assert_array_equal(minimum.std, [1e-3] * 6)
+    assert 0.0 < minimum.probability < 1.0
     assert 1e-3 < tracked_from_prior(made, 104 * hour).std[0] < 0.1, "before the log shows anything: over all widths"
     assert tracked_from_prior(made, 115 * hour).std[0] == pytest.approx(0.2)
 

@@ -476,14 +476,14 @@ def test_slow_motion_without_noise_is_not_flat_where_it_turns_back():
 
 def test_a_long_rest_near_the_largest_value_hides_no_plateau_far_above_it(monkeypatch):
     """As gravity at rest before a flight: too many samples to be held, until a larger value shows what they were."""
-    monkeypatch.setattr(saturation, "MOST_NEAR", 5000)
+    monkeypatch.setattr(saturation, "MAX_NEAR", 5000)
     rest = 1.0 + np.random.default_rng(1).normal(0.0, 0.005, 40_000)
     rates = np.concatenate([rest, turned_on_a_table(5.0)])
     marked, flight = saturation.at_limit(rates), saturation.at_limit(rates[len(rest) :])
     assert not marked[: len(rest)].any()
     assert flight.any()
     np.testing.assert_array_equal(marked[len(rest) :], flight)
-    monkeypatch.setattr(saturation, "MOST_NEAR", 100)
+    monkeypatch.setattr(saturation, "MAX_NEAR", 100)
     assert not saturation.at_limit(np.abs(turned_on_a_table(5.0))).any()
 
 

@@ -274,7 +274,7 @@ def test_a_setting_reaches_the_search(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_setting_reaches_the_alignment(folder: Path) -> None:
-    done = run("diagnose", folder / "arm.mcap", "--set", "alignment.least_s=1000", "--quiet")
+    done = run("diagnose", folder / "arm.mcap", "--set", "alignment.min_s=1000", "--quiet")
     assert done.exit_code == 0, done.output
     assert "no stretch of 1000 s" in done.stdout
 

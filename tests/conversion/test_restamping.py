@@ -44,9 +44,9 @@ def logged(path: Path, stamps: np.ndarray, rows: np.ndarray | None = None) -> Pa
 
 
 @pytest.mark.parametrize(
-    ("stamps", "most_ms"), [(np.repeat(T_NS[4::5], 5), 0.01), (T_NS // 10**9 * 10**9, 0.01)], ids=["batches", "whole seconds"]
+    ("stamps", "max_ms"), [(np.repeat(T_NS[4::5], 5), 0.01), (T_NS // 10**9 * 10**9, 0.01)], ids=["batches", "whole seconds"]
 )
-def test_messages_that_share_a_stamp_are_told_of_and_restamped(stamps: np.ndarray, most_ms: float, tmp_path: Path) -> None:
+def test_messages_that_share_a_stamp_are_told_of_and_restamped(stamps: np.ndarray, max_ms: float, tmp_path: Path) -> None:
     shared = int((np.diff(stamps) == 0).sum())
     report = convert(logged(tmp_path / "in.mcap", stamps), tmp_path / "kept.mcap")
     assert [note for note in report.notes if "stamp" in note] == [
@@ -58,7 +58,7 @@ def test_messages_that_share_a_stamp_are_told_of_and_restamped(stamps: np.ndarra
         assert any("--restamp" in line for line in log.metadata()["imutool/remarks"].values())
     convert(tmp_path / "in.mcap", tmp_path / "even.mcap", restamp=True)
     even = read(tmp_path / "even.mcap").imu
-    assert np.abs(even.t_ns - T_NS).max() <= most_ms * MS
+    assert np.abs(even.t_ns - T_NS).max() <= max_ms * MS
     assert np.array_equal(even.gyro, VALUES[:, :3])
 
 

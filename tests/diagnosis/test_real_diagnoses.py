@@ -20,7 +20,7 @@ OF_ONE = 0.05  # z of so many honest draws lies as near to 1: its own deviation 
 ARM_M = (0.3, -0.2, 0.25)
 DRAWN = 0.06  # of a slope from so many draws
 LAG_S = 5e-4  # of a lag: a matrix of all windows takes a little of what a mean lag does
-LONG_S, MOST_LAG_STD_S = 90.0, 2e-3  # time that shows a lag at 0.3 Hz; a deviation that tells twelve milliseconds from none
+LONG_S, MAX_LAG_STD_S = 90.0, 2e-3  # time that shows a lag at 0.3 Hz; a deviation that tells twelve milliseconds from none
 POSE_NOISE = 0.05  # of what the lever arm adds: how inexact splines through exact poses may be
 
 
@@ -164,7 +164,7 @@ def test_positions_that_come_late_are_found_in_every_band_and_none_where_they_do
         pair = replace(planted.pair(felt, {}, 1), ideal=ideal)
         for lag_s, std_s in check.position_lags_s(pair):
             assert abs(lag_s - expected_s) < 4.0 * std_s + LAG_S
-            assert std_s < MOST_LAG_STD_S
+            assert std_s < MAX_LAG_STD_S
 
 
 def test_physics_of_one_recording_removes_its_misfit_of_another(bench: Any, tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 START_NS = 1_403_636_580_838_555_648
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0"
 IMAGE_BYTES = 400_000
-ROWS, MOST_BYTES = 10_000, 60  # bytes a sample at 2 kHz: the evidence of tenths of a second; a sample and a pose have 120
+ROWS, MAX_BYTES = 10_000, 60  # bytes a sample at 2 kHz: the evidence of tenths of a second; a sample and a pose have 120
 NUMBERS = st.floats(-1e300, 1e300, allow_nan=False)
 
 
@@ -266,7 +266,7 @@ def test_memory_does_not_grow_with_the_samples(tmp_path: Path, monkeypatch: pyte
         export(tmp_path / f"{count}.mcap", tmp_path / str(count), format="euroc")
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peaks[1] - peaks[0] < MOST_BYTES * 4 * ROWS
+    assert peaks[1] - peaks[0] < MAX_BYTES * 4 * ROWS
 
 
 def test_jpeg_keeps_its_ending_and_what_is_no_image_is_refused(tmp_path: Path) -> None:

@@ -140,11 +140,11 @@ def test_smoothing_a_linear_case_is_least_squares() -> None:
     for one in mean:
         found.append(rest_step(x, one, np.full(3, 1e-8), 0.5, WALK, S))
         x = found[-1].after
-    q, r = WALK[0] ** 2 * 0.5 + inertial_filter.LEAST_VARIANCE, 1e-8 + S.rest_rad_s**2
+    q, r = WALK[0] ** 2 * 0.5 + inertial_filter.MIN_VARIANCE, 1e-8 + S.rest_rad_s**2
     # unknown: b0, b1, b2 along x, and d
     A = np.array([[1, 0, 0, 0], [0, 0, 0, 1], [-1, 1, 0, 0], [0, -1, 1, 0], [0, 1, 0, 1], [0, 0, 1, 1]], float)
     y = np.array([0, 0, 0, 0, 1e-3, 2e-3])
-    w = 1 / np.array([STD[0] ** 2, STD[6] ** 2 + 2 * inertial_filter.LEAST_VARIANCE, q, q, r, r])
+    w = 1 / np.array([STD[0] ** 2, STD[6] ** 2 + 2 * inertial_filter.MIN_VARIANCE, q, q, r, r])
     solved = np.linalg.solve(A.T @ (w[:, None] * A), A.T @ (w * y))
     np.testing.assert_allclose([s.bias[0] for s in smooth(found)], solved[:3], rtol=1e-3)
 

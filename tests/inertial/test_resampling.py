@@ -9,7 +9,7 @@ from scipy.interpolate import make_interp_spline
 from imutool.inertial.resampling import AS_GOOD, refined
 
 RATE_HZ, NOISE, COUNT = 200.0, np.array([0.01, 0.01]), 400
-MOST = AS_GOOD * NOISE[0] / np.sqrt(COUNT)
+MAX = AS_GOOD * NOISE[0] / np.sqrt(COUNT)
 
 
 def motion(t_s: np.ndarray, fast_hz: float) -> np.ndarray:
@@ -25,8 +25,8 @@ def test_a_spline_through_refined_samples_is_the_motion(fast_hz: float) -> None:
     finer = refined(x, NOISE, COUNT)
     grid_s = np.linspace(t_s[0], t_s[-1], len(finer))
     off, plain = (make_interp_spline(at_s, y, k=3)(between_s) - truth for at_s, y in ((grid_s, finer), (t_s, x)))
-    assert np.sqrt((off**2).mean(axis=0)).max() < MOST
-    assert np.sqrt((plain[:, 0] ** 2).mean()) > MOST  # so that something was to be done
+    assert np.sqrt((off**2).mean(axis=0)).max() < MAX
+    assert np.sqrt((plain[:, 0] ** 2).mean()) > MAX  # so that something was to be done
     every = (len(finer) - 1) // (len(x) - 1)
     assert finer[::every] == pytest.approx(x, abs=1e-9)
 

@@ -114,9 +114,9 @@ def test_a_fast_vibration_that_a_recording_shares_is_no_noise_that_is_left() -> 
     recorded = x + 0.01 * np.random.default_rng(8).normal(size=x.shape)
     _, left = denoised(x, RATE_HZ, recorded=recorded)
     assert left.density.max() < 0.01 * 2.0 / RATE_HZ
-    assert np.max(left.most) < 0.05
+    assert np.max(left.maximum) < 0.05
     noisy = x + 0.3 * np.random.default_rng(9).normal(size=x.shape)
-    np.testing.assert_allclose(denoised(noisy, RATE_HZ, recorded=recorded)[1].most, 0.3, rtol=0.2)
+    np.testing.assert_allclose(denoised(noisy, RATE_HZ, recorded=recorded)[1].maximum, 0.3, rtol=0.2)
 
 
 def test_a_simulation_without_noise_has_none_left_where_a_recording_differs_by_its_motion() -> None:
@@ -130,7 +130,7 @@ def test_a_simulation_without_noise_has_none_left_where_a_recording_differs_by_i
         clean, left = denoised(simulated, RATE_HZ, recorded=recording)
         assert np.sqrt(((clean - simulated) ** 2).mean()) < 1e-3
         assert left.density.max() * RATE_HZ / 2.0 < 1e-4
-        assert np.max(left.most) < 0.01
+        assert np.max(left.maximum) < 0.01
 
 
 def test_impacts_that_a_recording_shares_are_no_noise() -> None:

@@ -29,12 +29,12 @@ def seen(t_ns: np.ndarray) -> SensorStamps:
     return stamps
 
 
-@pytest.mark.parametrize("most_exact", [clock.MOST_EXACT, 4096])
-def test_a_clock_is_that_of_all_steps(monkeypatch: pytest.MonkeyPatch, most_exact: int) -> None:
-    monkeypatch.setattr(clock, "MOST_EXACT", most_exact)
+@pytest.mark.parametrize("max_exact", [clock.MAX_EXACT, 4096])
+def test_a_clock_is_that_of_all_steps(monkeypatch: pytest.MonkeyPatch, max_exact: int) -> None:
+    monkeypatch.setattr(clock, "MAX_EXACT", max_exact)
     t_ns = late()
     steps, found = np.diff(t_ns), seen(t_ns)
-    median, exact = float(np.median(steps)), most_exact > COUNT
+    median, exact = float(np.median(steps)), max_exact > COUNT
     assert found.steps.median() == (median if exact else pytest.approx(median, rel=COARSE))
     assert found.period_ns == (usual_period(t_ns) if exact else pytest.approx(usual_period(t_ns), rel=COARSE))
     steady, usual = steps[steps <= 60_000_000_000], steps[np.abs(steps - median) <= 0.5 * median]
@@ -48,7 +48,7 @@ def test_a_clock_is_that_of_all_steps(monkeypatch: pytest.MonkeyPatch, most_exac
 
 
 def test_a_histogram_takes_the_same_memory_for_any_number_of_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clock, "MOST_EXACT", 4096)
+    monkeypatch.setattr(clock, "MAX_EXACT", 4096)
     steps = clock.Steps()
     for _ in range(20):
         steps.see(np.diff(late()))

@@ -19,7 +19,7 @@ from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 
 START_NS, RATE_HZ, COUNT = 1_700_000_000_000_000_000, 1000, 20_000
-MOST_BYTES = 40  # a sample at 1000 Hz: means of tenths of a second; the samples alone have 56
+MAX_BYTES = 40  # a sample at 1000 Hz: means of tenths of a second; the samples alone have 56
 
 
 def moving(count: int = COUNT) -> Imu:
@@ -77,9 +77,9 @@ def peak_bytes(log: Path) -> int:
 
 
 def test_memory_does_not_grow_with_the_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clock, "MOST_EXACT", 1 << 12)
+    monkeypatch.setattr(clock, "MAX_EXACT", 1 << 12)
     peaks = []
     for count in (COUNT, 5 * COUNT):
         write(Recording("log", moving(count)), tmp_path / f"{count}.mcap")
         peaks.append(peak_bytes(tmp_path / f"{count}.mcap"))
-    assert peaks[1] - peaks[0] < MOST_BYTES * 4 * COUNT
+    assert peaks[1] - peaks[0] < MAX_BYTES * 4 * COUNT

@@ -439,12 +439,12 @@ def test_messages_that_a_message_index_leaves_out_are_counted(tmp_path: Path, mo
     assert described(tmp_path / "a.mcap")["messages"] == 200
 
 
-@pytest.mark.parametrize("most_held", [clock.MOST_HELD, 1000])
+@pytest.mark.parametrize("max_held", [clock.MAX_HELD, 1000])
 def test_chunks_without_indexes_are_not_unpacked_for_each_topic(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most_held: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, max_held: int
 ) -> None:
     """A log of 8 MB with 3000 topics took 128 s."""
-    monkeypatch.setattr(clock, "MOST_HELD", most_held)
+    monkeypatch.setattr(clock, "MAX_HELD", max_held)
     with (tmp_path / "a.mcap").open("wb") as file:
         writer = Writer(file, chunk_size=2000, index_types=IndexType.NONE)
         writer.start()

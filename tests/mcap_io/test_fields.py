@@ -208,7 +208,7 @@ def test_others_are_what_varies_but_the_signal_and_covariances(robot: tuple[Path
     expected |= {f"/joint_states.{k}[{i}]" for k in ("position", "effort") for i in range(3)}
     assert set(found) == expected
     assert np.array_equal(found["/odom.twist.twist.linear.y"].values, twist[:, 1])
-    assert len(others(path, "/odom.twist.twist.linear.x", most=4)) == 4
+    assert len(others(path, "/odom.twist.twist.linear.x", maximum=4)) == 4
 
 
 def test_a_joint_that_goes_missing_is_refused_and_is_no_channel(tmp_path: Path) -> None:
@@ -413,9 +413,9 @@ def test_memory_is_bounded_by_a_chunk_not_by_the_log(tmp_path: Path) -> None:
             writer.finish()
         tracemalloc.start()
         assert read_field(path, "/a.x").values[-1] == count - 1
-        most = tracemalloc.get_traced_memory()[1]
+        maximum = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        return most
+        return maximum
 
     peak(500)
     assert peak(10_000) < peak(500) + 10_000 * 400  # the log grows by 38 MB, what may be kept of it by 4

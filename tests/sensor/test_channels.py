@@ -16,7 +16,7 @@ from imutool.inertial.kinematics import Trajectory
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording, Scalars
-from imutool.sensor.channels import MOST_TRIED, with_channels
+from imutool.sensor.channels import MAX_TRIED, with_channels
 from imutool.sensor.made_up_flight import FlightSettings, trajectory
 
 RATE_HZ, DURATION_S, SLOW_HZ = 100.0, 30.0, 10.0
@@ -125,14 +125,14 @@ def test_what_cannot_drive_is_no_channel(path: Trajectory, tmp_path: Path) -> No
 def test_of_many_fields_the_first_are_tried_and_the_others_named(path: Trajectory, tmp_path: Path) -> None:
     write(recording(path), tmp_path / "base.mcap")
     rng = np.random.default_rng(1)
-    fields = "\n".join(f"float64 x{k}" for k in range(MOST_TRIED + 20)) + "\nfloat64 temperature"
+    fields = "\n".join(f"float64 x{k}" for k in range(MAX_TRIED + 20)) + "\nfloat64 temperature"
 
     def row(t_s: float) -> dict[str, Any]:
-        return {f"x{k}": float(rng.normal()) for k in range(MOST_TRIED + 20)} | {"temperature": float(warm(t_s))}
+        return {f"x{k}": float(rng.normal()) for k in range(MAX_TRIED + 20)} | {"temperature": float(warm(t_s))}
 
     log = with_topics(tmp_path / "base.mcap", tmp_path / "log.mcap", path.start_ns, {"/many": ("a/msg/Many", fields, 5.0, row)})
     got = with_channels(read(log), log)
-    assert got.added == ("/many.temperature", *(f"/many.x{k}" for k in range(MOST_TRIED - 1)))
+    assert got.added == ("/many.temperature", *(f"/many.x{k}" for k in range(MAX_TRIED - 1)))
     assert len(got.untried) == 21
     assert "not tried" in got.remark
     assert "and 9 more" in got.remark

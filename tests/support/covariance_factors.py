@@ -14,9 +14,9 @@ from .error_growth import Motion
 
 SHARES = (0.68, 0.95, 0.997)
 FEATURES = "constant", "rate", "force", "time"  # logarithms of rms rate, of rms change of the force, and of the time in the log
-LEAST_RATE, LEAST_FORCE, SOON_S = 0.03, 0.1, 10.0  # rad/s, m/s², s: below these the logarithms hardly change
+MIN_RATE, MIN_FORCE, SOON_S = 0.03, 0.1, 10.0  # rad/s, m/s², s: below these the logarithms hardly change
 WEIGHT_STD, WINDOWS_A_LOG = 0.5, 10.0  # prior of the head's weights; independent windows for which a log counts
-MOST_FACTOR, PRIOR_LOGS = 16.0, 3  # of a covariance; n logs of three axes show the factor's logarithm to sqrt(2 / 3n)
+MAX_FACTOR, PRIOR_LOGS = 16.0, 3  # of a covariance; n logs of three axes show the factor's logarithm to sqrt(2 / 3n)
 BISECTIONS = 40
 
 
@@ -56,7 +56,7 @@ def features_of(motion: Motion, windows: list[slice]) -> Float64[np.ndarray, "m 
     for window in windows:
         rate, force = motion.samples[window, :3], motion.samples[window, 3:]
         sizes = (rate**2).sum(axis=1).mean(), force.var(axis=0).sum()
-        logarithms = [0.5 * np.log(size + least**2) for size, least in zip(sizes, (LEAST_RATE, LEAST_FORCE), strict=True)]
+        logarithms = [0.5 * np.log(size + minimum**2) for size, minimum in zip(sizes, (MIN_RATE, MIN_FORCE), strict=True)]
         rows.append([1.0, *logarithms, np.log(motion.t_s[window.start] + SOON_S) - np.log(SOON_S)])
     return np.reshape(rows, (-1, len(FEATURES)))
 
@@ -87,7 +87,7 @@ def head(logs: list[Judgement]) -> Float64[np.ndarray, " f"]:
 
 def needed_factors(log: Judgement) -> Float64[np.ndarray, " m"]:
     """Factor on the bias's covariance that puts each window on its ellipsoid of `SHARES[0]`, by bisection of its logarithm."""
-    low, high = np.full(len(log.error), -np.log(MOST_FACTOR)), np.full(len(log.error), np.log(MOST_FACTOR))
+    low, high = np.full(len(log.error), -np.log(MAX_FACTOR)), np.full(len(log.error), np.log(MAX_FACTOR))
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         outside = log.squares(np.exp(middle)[:, None, None]) > chi2.ppf(SHARES[0], 3)

@@ -14,9 +14,9 @@ from rerun.chunk import RrdReader
 
 from support import saved_rrd
 
-LEAST = 200  # pixels of a curve; its sample in a legend has some fifty
+MIN = 200  # pixels of a curve; its sample in a legend has some fifty
 WITHIN = 36.0  # in RGB: what an edge mixes of a line with its ground, and less than two colours of ours are apart
-MOST_COLORS = 12  # of one path: its neighbours are near each other
+MAX_COLORS = 12  # of one path: its neighbours are near each other
 MARKS = ("/worst", "/error_vec")  # no curves: a body may hide a mark, and where nothing is wrong a vector has no length
 COLORS = ("SeriesLines:colors", "LineStrips3D:colors", "LineStrips2D:colors")
 
@@ -111,11 +111,11 @@ def column(style: Any, name: str) -> list[Any]:
 # ── pictures ──
 
 
-def pictures(viewer: Any, blueprint: Any, log: Any, duration_s: float, most: int | None = None) -> dict[Any, np.ndarray]:
+def pictures(viewer: Any, blueprint: Any, log: Any, duration_s: float, maximum: int | None = None) -> dict[Any, np.ndarray]:
     """Views of a layout as they are drawn, the cursor at the end of the log, by identifier: all, or of so many tabs."""
     viewer.show(log, blueprint)
     found = {}
-    for views in islice(faces(blueprint), most):
+    for views in islice(faces(blueprint), maximum):
         viewer.lay_out(blueprint)
         _to_the_end(viewer, duration_s)
         found |= dict(zip([view.id for view in views], viewer.pictures([view.id for view in views]), strict=True))
@@ -137,13 +137,13 @@ def _to_the_end(viewer: Any, duration_s: float) -> None:
 def unseen(view: Any, picture: np.ndarray, curves: Sequence[Curve]) -> list[str]:
     """The curves that a view is to show and its picture does not."""
     counted = [(curve, pixels(picture, curve)) for curve in shown(view, curves)]
-    return [f"{view.name}: {curve.entity} {curve.name} ({count} px)" for curve, count in counted if count < LEAST]
+    return [f"{view.name}: {curve.entity} {curve.name} ({count} px)" for curve, count in counted if count < MIN]
 
 
 def pixels(picture: np.ndarray, curve: Curve) -> int:
     """How many pixels have a curve's colour."""
     near = np.zeros(picture.shape[:2], dtype=bool)
-    for color in curve.colors[:: 1 + len(curve.colors) // MOST_COLORS]:
+    for color in curve.colors[:: 1 + len(curve.colors) // MAX_COLORS]:
         off = [picture[..., k].astype(np.int32) - int(color[k]) for k in range(3)]
         near |= sum(part * part for part in off) <= WITHIN**2
     return int(near.sum())

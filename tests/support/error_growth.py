@@ -26,7 +26,7 @@ from imutool.inertial.strapdown import GRAVITY_W, with_velocity
 from imutool.recording import Imu, Poses, seconds
 
 Vector6 = Float64[np.ndarray, "6"]
-LEAST_TRUSTED = 0.5  # share of a window's samples with truth
+MIN_TRUSTED = 0.5  # share of a window's samples with truth
 LONGEST_STEP_S = 0.1  # between two samples of a window
 LAG_S = 1.0  # of the differences that show the errors of the poses
 FEWEST = 4  # differences, to say how good the poses are
@@ -47,7 +47,7 @@ class Motion(NamedTuple):
         rows = slice(first, last + 1)
         if last >= len(self.t_s) or not (self.trusted[first] and self.trusted[last]):
             return None
-        whole = self.trusted[rows].mean() >= LEAST_TRUSTED and np.diff(self.t_s[rows]).max() <= LONGEST_STEP_S
+        whole = self.trusted[rows].mean() >= MIN_TRUSTED and np.diff(self.t_s[rows]).max() <= LONGEST_STEP_S
         return rows if whole else None
 
     def windows(self, length_s: float, from_s: float = 0.0) -> list[slice]:

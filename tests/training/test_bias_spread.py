@@ -13,7 +13,7 @@ from imutool.bias_start.bias_at_rest import rest_differences
 from imutool.bias_start.initial_bias import AT_REST_STD
 from imutool.bias_start.prior_width import USUAL_WALK
 from imutool.mcap_io.write import write
-from imutool.training.bias_spread import MOST_TAIL, TURN_ON_STD, USUAL_STD, shift_at_rest, turn_on_prior
+from imutool.training.bias_spread import MAX_TAIL, TURN_ON_STD, USUAL_STD, shift_at_rest, turn_on_prior
 from imutool.training.run import train
 from imutool.training.settings import TrainSettings
 
@@ -32,9 +32,9 @@ def biases(*means: float, seed: int = 0) -> np.ndarray:
 
 def test_six_logs_of_one_switching_on_say_little_of_the_next_one() -> None:
     rest = biases(*[0.01] * 6)
-    mean, std, least_std, sessions = turn_on_prior(rest, spans(*np.arange(6) / 4))
+    mean, std, min_std, sessions = turn_on_prior(rest, spans(*np.arange(6) / 4))
     assert (std[:3] > TURN_ON_STD["gyro"]).all()
-    assert (least_std < USUAL).all(), "unless the sensor repeats its bias"
+    assert (min_std < USUAL).all(), "unless the sensor repeats its bias"
     np.testing.assert_allclose(mean, rest.mean(axis=0))
     (session,) = sessions
     assert (session.std < USUAL).all(), "the next log of the same day is like them"
@@ -66,8 +66,8 @@ def test_a_sensor_without_bias_gets_none_by_a_new_switching_on() -> None:
 
 def test_one_log_is_a_session_of_its_own() -> None:
     _, std, _, (session,) = turn_on_prior(biases(0.01), spans(0.0))
-    np.testing.assert_allclose(std[:3], np.sqrt(2 * TURN_ON_STD["gyro"] ** 2 + MOST_TAIL * USUAL[0] ** 2))
-    np.testing.assert_allclose(session.std, np.sqrt(2 * MOST_TAIL) * USUAL)
+    np.testing.assert_allclose(std[:3], np.sqrt(2 * TURN_ON_STD["gyro"] ** 2 + MAX_TAIL * USUAL[0] ** 2))
+    np.testing.assert_allclose(session.std, np.sqrt(2 * MAX_TAIL) * USUAL)
 
 
 def test_the_next_log_of_a_session_lies_within_its_prior_however_few_its_logs() -> None:
@@ -117,7 +117,7 @@ def test_a_steady_drive_is_no_stop() -> None:
     ],
 )
 def test_a_walk_is_found_where_the_poses_show_it(
-    walk: float, truth_noise: float, least: float, most: float, tmp_path: Path
+    walk: float, truth_noise: float, minimum: float, maximum: float, tmp_path: Path
 ) -> None:
     kind = Switchings(truth_noise=truth_noise, walk_rad_s2_rthz=walk, rest_s=5.0, duration_s=40.0)
     paths = [tmp_path / f"{seed}.mcap" for seed in range(4)]
@@ -125,7 +125,7 @@ def test_a_walk_is_found_where_the_poses_show_it(
         write(log(seed, 0, kind), path)
     model = train(paths, tmp_path / "model.safetensors", method="linear", settings=TrainSettings(compare=False))
     assert (model.walk_std[:3] == model.walk_std[0]).all()
-    assert least < model.walk_std[0] < most
+    assert minimum < model.walk_std[0] < maximum
 
 
 def test_logs_too_short_for_a_walk_leave_it_as_usual(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from imutool.config import Settings
 from imutool.units import SENSORS, Sensor
 
 MOMENTUM = 0.1  # of the running mean: batch norm's usual value
-LEAST_SCALE = (1e-2, 1e-2, 1e-2, 1e-1, 1e-1, 1e-1)  # rad/s, m/s²: limits the gain of a channel without motion
+MIN_SCALE = (1e-2, 1e-2, 1e-2, 1e-1, 1e-1, 1e-1)  # rad/s, m/s²: limits the gain of a channel without motion
 
 
 class FoldedLayer(NamedTuple):
@@ -143,7 +143,7 @@ class Network(BiasNetwork):
     def see(self, gyro: Float[Tensor, "n 3"], accel: Float[Tensor, "n 3"]) -> None:
         """Set origin and unit of each channel to its mean and standard deviation."""
         u = torch.cat([gyro, accel], dim=1)
-        scale = torch.maximum(u.std(0), u.new_tensor(LEAST_SCALE))
+        scale = torch.maximum(u.std(0), u.new_tensor(MIN_SCALE))
         for sensor in SENSORS:
             net = self._net(sensor)
             net.centre.copy_(u.mean(0))

@@ -168,15 +168,15 @@ class _EulerSteps(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         weights, seen, bent = ctx.weights, ctx.seen, ctx.bent
-        left: list[list[Tensor]] = [[] for _ in weights]  # derivative by what leaves each layer, last step first
+        derivatives: list[list[Tensor]] = [[] for _ in weights]  # derivative by what leaves each layer, last step first
         g = grad[-1]
         for i in range(len(grad) - 2, -1, -1):
-            left[-1].append(ctx.step * g)
-            by_x, end = left[-1][-1] @ weights[-1], len(weights) - 1
+            derivatives[-1].append(ctx.step * g)
+            by_x, end = derivatives[-1][-1] @ weights[-1], len(weights) - 1
             for size in reversed(ctx.sizes):
                 by_y = by_x
                 for k in range(end - 1, end - size - 1, -1):
-                    left[k].append(by_y)
+                    derivatives[k].append(by_y)
                     by_y = by_y @ weights[k]
                     if k == end - 1 and size > 1:
                         by_y = tanh_backward(by_y, seen[k][i])
@@ -185,7 +185,7 @@ class _EulerSteps(torch.autograd.Function):
                 by_x, end = by_x + by_y, end - size
             g = grad[i] + g + by_x[:, :3] / ctx.unit
         by_weights: list[Tensor] = []
-        for leaving, entering in zip(left, seen, strict=True):
+        for leaving, entering in zip(derivatives, seen, strict=True):
             d = torch.cat(leaving[::-1])
             by_weights += [d.mT @ torch.cat(entering), d.sum(0)]
         return None, None, None, None, None, None, g, *by_weights

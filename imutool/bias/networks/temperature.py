@@ -18,7 +18,7 @@ from imutool.recording import Recording, Scalars, seconds
 from imutool.sensor.signals import TEMPERATURE_TERMS, Load, SignalFilter, Signals
 from imutool.units import Sensor
 
-LEAST_RANGE_K = 1.0  # over all logs: less tells nothing about a temperature
+MIN_RANGE_K = 1.0  # over all logs: less tells nothing about a temperature
 STEP_S = 10.0  # between two numbers of the drift, from which its walk is taken
 
 logger = logging.getLogger(__name__)
@@ -49,7 +49,7 @@ def temperature_scale(recordings: Sequence[Recording], channel: str = "", *, wan
         return None
     seen = [_within(channel, recording) for (_, channel), recording in zip(known, recordings, strict=True)]
     low, high = min(float(T.min()) for T in seen), max(float(T.max()) for T in seen)
-    if high - low < LEAST_RANGE_K and not wanted:
+    if high - low < MIN_RANGE_K and not wanted:
         return None
     blank = Scale(known[0][0], 0.5 * (low + high), 0.5 * (high - low), np.zeros(TEMPERATURE_TERMS))
     rows = [temperature_terms(recording, blank) for recording in recordings]

@@ -14,7 +14,7 @@ from imutool.recording.columns import median, true_ranges
 
 PART = 64  # samples whose median period is one row
 CHANGE = 1.2  # times the usual period, or the usual period so many times this one
-LEAST_PARTS = 4  # in a row
+MIN_PARTS = 4  # in a row
 DISTRUST = 0.02  # of the samples: a model knows one rate
 
 
@@ -49,7 +49,7 @@ class ChangedRate(Rule):
         period, ends = np.concatenate(self._rows), np.concatenate(self._ends)
         usual = float(median(period))
         other = (period > CHANGE * usual) | (period * CHANGE < usual)
-        stretches = [(a, b) for a, b in true_ranges(other) if b - a >= LEAST_PARTS]
+        stretches = [(a, b) for a, b in true_ranges(other) if b - a >= MIN_PARTS]
         if not stretches:
             return
         intervals = tuple((int(ends[a, 0]), int(ends[b - 1, 1])) for a, b in stretches)

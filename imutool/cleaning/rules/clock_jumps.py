@@ -13,7 +13,7 @@ from imutool.recording.columns import median
 
 PART = 256  # samples whose median delay is one row
 AROUND = 3  # rows on either side of a step, so that a burst that comes late is none
-LEAST_S = 0.02
+MIN_S = 0.02
 SCATTERS = 8.0  # of the delay within rows
 NOT_ITS_PERIOD = 0.5  # of a jump, by which the stamps' own step differs from what the rate says: then it is they that jump
 
@@ -86,11 +86,11 @@ class ClockJumps(Rule):
         if len(self._rows) < 2:
             return
         level = np.array([row[0] for row in self._rows])
-        least = max(LEAST_S * 1e9, SCATTERS * float(median(np.array([row[1] for row in self._rows]))))
+        minimum = max(MIN_S * 1e9, SCATTERS * float(median(np.array([row[1] for row in self._rows]))))
         k = 0
         while k + 1 < len(level):
             before, after = median(level[max(0, k + 1 - AROUND) : k + 1]), median(level[k + 1 : k + 1 + AROUND])
-            if abs(level[k + 1] - level[k]) > least and abs(after - before) > least:
+            if abs(level[k + 1] - level[k]) > minimum and abs(after - before) > minimum:
                 row = max(self._rows[k], self._rows[k + 1], key=lambda row: row[2])
                 yield row, float(after - before) * 1e-9
                 k += 1

@@ -34,17 +34,17 @@ class Duplicates(Rule):
             seen = 0 if before is None else len(before.number)
             _, first, which = np.unique(both.stamp_ns, return_index=True, return_inverse=True)
             original = first[which]
-            again = original[seen:] != np.arange(seen, len(both.number))
-            if again.any():
+            repeated = original[seen:] != np.arange(seen, len(both.number))
+            if repeated.any():
                 values = both.values.view(np.int64)
                 same = (values[seen:] == values[original[seen:]]).all(axis=1)
-                again &= same | (both.stamp_ns == np.maximum.accumulate(both.stamp_ns))[seen:]
-                self._same += int((same & again).sum())
-                self._places.add(samples.number[again], samples.stamp_ns[again])
-                self.dropped.append(samples.number[again])
-            left = samples.where(~again)
+                repeated &= same | (both.stamp_ns == np.maximum.accumulate(both.stamp_ns))[seen:]
+                self._same += int((same & repeated).sum())
+                self._places.add(samples.number[repeated], samples.stamp_ns[repeated])
+                self.dropped.append(samples.number[repeated])
+            kept = samples.where(~repeated)
             before = both.where(slice(max(0, len(both.number) - MEMORY), None))
-            yield left
+            yield kept
 
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """Finding with the number of bitwise equal samples."""

@@ -13,13 +13,13 @@ from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
 from imutool.cleaning.stamp_line import batch_size, batch_words, bunched, lost_samples, usual_period
 from imutool.recording import nanoseconds
-from imutool.recording.columns import MOST_GAP_S
+from imutool.recording.columns import MAX_GAP_S
 from imutool.recording.sample_order import Ticked, ticked
 
 MISSING = "samples missing"
 MISSING_STEP = 1.5  # a step of this many median periods or more has lost samples
 FEWEST_STEPS = 16  # for a median of their own
-MOST = 100_000  # gaps held in memory; of a log with more, the rest is only counted
+MAX = 100_000  # gaps held in memory; of a log with more, the rest is only counted
 SERIOUS_SHARE, SERIOUS_S = 1e-3, 1.0
 PAUSE_NS = nanoseconds(60.0)  # nobody recorded: nothing is missing
 
@@ -71,10 +71,10 @@ class Gaps(Rule):
         self._coarse = ticked(stamp, self._coarse)
         lost = missing(stamp, self._period_ns, self._coarse)
         lost = np.where(lost > 0, np.maximum(lost - (np.diff(number) - 1), 0), 0)
-        for row in np.flatnonzero(steps > PAUSE_NS)[: MOST - len(self._pauses)]:
+        for row in np.flatnonzero(steps > PAUSE_NS)[: MAX - len(self._pauses)]:
             self._pauses.append(Gap(int(number[row + 1]), int(stamp[row]), int(stamp[row + 1]), 0))
         self.missing += int(lost.sum())
-        for row in np.flatnonzero(lost)[: MOST - len(self._rows)]:
+        for row in np.flatnonzero(lost)[: MAX - len(self._rows)]:
             self._rows.append(Gap(int(number[row + 1]), int(stamp[row]), int(stamp[row + 1]), int(lost[row])))
 
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
@@ -131,6 +131,6 @@ def missing(stamp_ns: Int64[np.ndarray, " n"], period_ns: float, coarse: Ticked 
 
 def pause_words(steps_ns: Int64[np.ndarray, " n"]) -> list[str]:
     """Pauses of the recorder among steps of stamps; a longer step is a jump of the clock."""
-    pauses = steps_ns[(steps_ns > PAUSE_NS) & (steps_ns <= nanoseconds(MOST_GAP_S))]
+    pauses = steps_ns[(steps_ns > PAUSE_NS) & (steps_ns <= nanoseconds(MAX_GAP_S))]
     longest = f", the longest of {pauses.max() * 1e-9:.0f} s" if len(pauses) else ""
     return [f"pauses of more than {PAUSE_NS * 1e-9:g} s: {len(pauses)}{longest}"] if longest else []

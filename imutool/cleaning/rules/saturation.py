@@ -23,18 +23,18 @@ LEVELS = 10
 FEW_SAMPLES, FAR, FINE_LEVELS = 3, 0.05, 64  # 64 levels: one step of the sensor is then at most 3 % of its range
 BAND, QUIET = 0.97, 0.75  # of the extreme value, and of the calmest steps: what is less is quieter than the sensor at rest
 WIDER = 1.1  # times a flat end, that the other end of its range has at most: what rests at gravity is flat, too
-LEAST_FLAT, MOSTLY = 30, 0.6  # of noise, 0.39 are so quiet; EuRoC, TUM-VI, FETCH and BROAD have at most 0.52
+MIN_FLAT, MOSTLY = 30, 0.6  # of noise, 0.39 are so quiet; EuRoC, TUM-VI, FETCH and BROAD have at most 0.52
 BLOCK, FEW_BLOCKS, CALMEST = 50, 3, 0.05  # samples of a block, least blocks away from the extreme, quantile of their steps
 RULE = (
     f"an axis is saturated at its own largest or smallest value where at least {SAMPLES} samples hold exactly "
     f"that value, more than {PILE:g} times as many as either of the next two values, among at least "
     f"{LEVELS} values, and it is not the median; {FEW_SAMPLES} samples are enough among at least {FINE_LEVELS} values, "
-    f"where the next value is {100 * FAR:g} % nearer to zero; or where {LEAST_FLAT} samples, and {MOSTLY:.0%} of those within "
+    f"where the next value is {100 * FAR:g} % nearer to zero; or where {MIN_FLAT} samples, and {MOSTLY:.0%} of those within "
     f"{1 - BAND:.0%} of it, change by less than {QUIET:.0%} of the axis' calmest steps, and no value of the other sign is "
     f"{WIDER - 1:.0%} larger: clipped before a calibration"
 )
 KEPT = 3  # values at either end: the last one, and the two it is compared with
-MOST_NEAR = 1_000_000  # samples near an extreme value that are held: more, as of gravity at rest, are no plateau
+MAX_NEAR = 1_000_000  # samples near an extreme value that are held: more, as of gravity at rest, are no plateau
 
 
 class Ends:
@@ -82,29 +82,29 @@ class _Near:
 
     def __init__(self) -> None:
         self._parts: list[tuple[Shaped[np.ndarray, " n"], ...]] = [NONE]
-        self._held, self._most = 0, PART
+        self._held, self._maximum = 0, PART
         self._lost = 0.0  # largest of the samples that were too many
 
-    def add(self, least: float, *columns: Shaped[np.ndarray, " n"]) -> None:
-        """Add samples above `least`; too many are lost, until a larger value shows that they were not near the extreme."""
-        if self._lost > least:
+    def add(self, minimum: float, *columns: Shaped[np.ndarray, " n"]) -> None:
+        """Add samples above `minimum`; too many are lost, until a larger value shows that they were not near the extreme."""
+        if self._lost > minimum:
             self._lost = float(np.max(columns[0], initial=self._lost))
             return
         self._parts.append(columns)
         self._held += len(columns[0])
-        if self._held > self._most:  # twice as many as were left last: each is moved a few times at most
-            values = self.above(least)[0]
+        if self._held > self._maximum:  # twice as many as were left last: each is moved a few times at most
+            values = self.above(minimum)[0]
             self._held = len(values)
-            self._most = 2 * self._held + PART
-            if self._held > MOST_NEAR:
-                self._parts, self._held, self._most, self._lost = [NONE], 0, PART, float(values.max())
+            self._maximum = 2 * self._held + PART
+            if self._held > MAX_NEAR:
+                self._parts, self._held, self._maximum, self._lost = [NONE], 0, PART, float(values.max())
 
-    def above(self, least: float) -> tuple[Shaped[np.ndarray, " n"], ...]:
-        """Samples above `least`; none where some of them are lost."""
-        if self._lost > least:
+    def above(self, minimum: float) -> tuple[Shaped[np.ndarray, " n"], ...]:
+        """Samples above `minimum`; none where some of them are lost."""
+        if self._lost > minimum:
             return NONE
         whole = [np.concatenate(column) for column in zip(*self._parts, strict=True)]
-        kept = whole[0] > least
+        kept = whole[0] > minimum
         self._parts = [tuple(column[kept] for column in whole)]
         return self._parts[0]
 
@@ -140,8 +140,8 @@ class Plateau:
         self._blocks.append(np.stack([np.abs(values[:whole]).reshape(-1, BLOCK).max(axis=1), calm]))
         for side, near in self._near.items():
             self._extreme[side] = float(np.max(side * values, where=finite, initial=self._extreme[side]))
-            kept = side * values > (least := BAND * self._extreme[side])
-            near.add(least, side * values[kept], step[kept], number[kept], stamp_ns[kept])
+            kept = side * values > (minimum := BAND * self._extreme[side])
+            near.add(minimum, side * values[kept], step[kept], number[kept], stamp_ns[kept])
 
     def flat(self, side: int) -> tuple[float, Numbers, Int64[np.ndarray, " m"]] | None:
         """Limit at the low (-1) or high (1) end, numbers and stamps of the samples there; None without saturation."""
@@ -152,7 +152,7 @@ class Plateau:
         if wider or len(calm) < FEW_BLOCKS or 2 * len(value) > self._samples:
             return None
         quiet = step < QUIET * quantile(calm, CALMEST)
-        if quiet.sum() < max(LEAST_FLAT, MOSTLY * len(value)):
+        if quiet.sum() < max(MIN_FLAT, MOSTLY * len(value)):
             return None
         return side * float(median(value[quiet])), number[quiet], stamp_ns[quiet]
 

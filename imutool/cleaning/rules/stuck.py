@@ -18,9 +18,9 @@ from imutool.cleaning.rules.not_finite import AXES
 from imutool.cleaning.samples import Samples, padded
 from imutool.recording.columns import median, true_ranges
 
-LEAST = 10  # equal samples in a row
-MOST_EQUAL = 3  # of six axes, beside a run: as one sensor does that is slower than the other
-AXIS_LEAST, AXIS_LEAST_S = 100, 1.0  # of one axis alone; the longest in real recordings is 17, or 0.17 s
+MIN = 10  # equal samples in a row
+MAX_EQUAL = 3  # of six axes, beside a run: as one sensor does that is slower than the other
+AXIS_MIN, AXIS_MIN_S = 100, 1.0  # of one axis alone; the longest in real recordings is 17, or 0.17 s
 HELD_SHARE = 0.3  # of neighbours that are equal: the topic is faster than its sensor
 AXIS_DISTRUST = 0.1  # of the time
 
@@ -39,10 +39,10 @@ class Stuck(Rule):
 
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
         """Yield the samples without repeats."""
-        for around, core in padded(stream, LEAST):
-            same, again = _repeats(around.values)
+        for around, core in padded(stream, MIN):
+            same, alternates = _repeats(around.values)
             self._noisy = _noisy(around.values[~same], self._noisy)
-            samples, repeated = around.where(core), again[core]
+            samples, repeated = around.where(core), alternates[core]
             self._equal += int(same[core].sum())
             self._pairs += len(repeated)
             if repeated.any():
@@ -58,7 +58,7 @@ class Stuck(Rule):
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """Findings about repeats, a topic faster than its sensor, and stuck axes."""
         if self._places.count:
-            what = f"samples that repeat the one before, in runs of {LEAST} and more: the sensor was stuck"
+            what = f"samples that repeat the one before, in runs of {MIN} and more: the sensor was stuck"
             yield Finding("stuck", "warning", what, **self._places.where(), action="dropped", confidence=0.95)
         if self._quiet.count:
             what = "samples that repeat the one before, of a sensor without noise: simulated, or stuck"
@@ -73,7 +73,7 @@ class Stuck(Rule):
             if axis.places.count:
                 share = min(axis.still_s / total_s, 1.0) if total_s > 0 else 0.0
                 distrust = f"{name} stands still for {100 * share:.0f} % of the time" if share > AXIS_DISTRUST else ""
-                what = f"samples with {name} unchanged for {AXIS_LEAST_S:g} s and more"
+                what = f"samples with {name} unchanged for {AXIS_MIN_S:g} s and more"
                 values = {"axis": name, "share": share}
                 yield Finding(
                     "stuck", "error" if distrust else "warning", what, **axis.places.where(), values=values, distrust=distrust
@@ -96,7 +96,7 @@ class _Axis:
         if ends[0]:  # goes on from the block before
             self._take(samples, 0, int(ends[0]), new=False)
         lengths = np.diff(ends)
-        long = np.flatnonzero(lengths >= AXIS_LEAST)
+        long = np.flatnonzero(lengths >= AXIS_MIN)
         for start, end in [(int(starts[i]), int(ends[i + 1])) for i in long if i + 1 < len(starts)]:
             self._take(samples, start, end, new=True)
         if len(starts):
@@ -114,34 +114,34 @@ class _Axis:
     def close(self) -> None:
         """Close the current run."""
         lasted_s = (self._stamps[1] - self._stamps[0]) * 1e-9
-        if self._count >= AXIS_LEAST and lasted_s >= AXIS_LEAST_S:
+        if self._count >= AXIS_MIN and lasted_s >= AXIS_MIN_S:
             self.places.add_run(self._numbers, self._stamps, self._count)
             self.still_s += lasted_s
         self._count = 0
 
 
 def repeated(values: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
-    """Samples that repeat the one before, in runs of `LEAST` and more, of a sensor with noise."""
-    same, again = _repeats(values)
-    return again & _noisy(values[~same], before=False)
+    """Samples that repeat the one before, in runs of `MIN` and more, of a sensor with noise."""
+    same, alternates = _repeats(values)
+    return alternates & _noisy(values[~same], before=False)
 
 
 def _repeats(values: Float64[np.ndarray, "n 6"]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Samples that repeat the one before, and those of them in runs of `LEAST` and more.
+    """Samples that repeat the one before, and those of them in runs of `MIN` and more.
 
     A sensor at rest, whose digits are coarser than its noise, repeats itself as well: there axis after axis changes alone.
     """
     equal = np.concatenate([np.zeros((1, 6), bool), np.diff(values, axis=0) == 0])[: len(values)]
     same: Bool[np.ndarray, " n"] = np.asarray(equal.all(axis=1))
-    again = np.zeros(len(same), bool)
+    alternates = np.zeros(len(same), bool)
     for first, end in true_ranges(same):
         around = [equal[k].sum() for k in (first - 1, end) if 0 < k < len(same)]
-        again[first:end] = end - first >= LEAST - 1 and not (around and max(around) > MOST_EQUAL)
-    return same, again
+        alternates[first:end] = end - first >= MIN - 1 and not (around and max(around) > MAX_EQUAL)
+    return same, alternates
 
 
 def _noisy(values: Float64[np.ndarray, "n 6"], before: bool) -> bool:
     """Whether samples show noise; `before` for too few samples."""
-    if len(values) < 4 * LEAST:
+    if len(values) < 4 * MIN:
         return before
     return any(median(np.abs(np.diff(column, n=3))) > median(np.abs(np.diff(column, n=2))) for column in values.T)

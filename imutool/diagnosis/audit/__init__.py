@@ -1,4 +1,4 @@
-"""Audit of a simulator: its IMU beside its own poses, a data sheet and a recording.
+"""Audit of a simulator: its IMU against its own poses, a data sheet and a recording.
 
 log ─ kinematics ─> Kinematics ─ kinematic_fit ─> KinematicFit ─ motion_faults, noise_faults ─> AuditReport
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imutool.diagnosis.audit.bandwidth import most_filter_delays
+from imutool.diagnosis.audit.bandwidth import max_filter_delays
 from imutool.diagnosis.audit.faults import FAULTS, FaultFound, found
 from imutool.diagnosis.audit.motion import KinematicFit, Kinematics, kinematic_fit, kinematics, units
 from imutool.diagnosis.audit.motion_faults import motion_faults, unexplained
@@ -30,7 +30,7 @@ from imutool.report import Report
 from imutool.units import AXES, SENSORS
 
 BY_RECORDING = ("body_centre", "clipping_absent", "digits_absent", "bandwidth_absent")
-LEAST_ARM_M = 0.02  # of the recording's sensor from its poses' point
+MIN_ARM_M = 0.02  # of the recording's sensor from its poses' point
 TIMING = ("backward_difference", "step_delay", "early_stamps")
 BY_NOISE = ("noise_absent", "noise_per_sample", "noise_density")
 
@@ -74,23 +74,23 @@ def audit(
     recording, real_mount = (None, AT_BODY) if real is None else read_simulation(real, imu=imu, simulated=False)
     sheet = datasheet.read(noise)
     try:
-        faults, untold, left = _faults(simulated, recording, sheet, (mount, real_mount))
+        faults, unknown_lines, motion_left = _faults(simulated, recording, sheet, (mount, real_mount))
     except DataError as error:
         raise error.at(sim) from error
     not_tested = dict(_not_tested(recording, sheet))
-    if untold and not any(fault.fault == "step_lines" for fault in faults):
-        at = " and ".join(f"{line.f_hz:.4g} Hz ({line.sensor})" for line in untold)
+    if unknown_lines and not any(fault.fault == "step_lines" for fault in faults):
+        at = " and ".join(f"{line.f_hz:.4g} Hz ({line.sensor})" for line in unknown_lines)
         not_tested["step_lines"] = (
             f"there are lines, at {at}, and the poses are too slow or too noisy to show whether the body moves so"
         )
     tested = tuple(name for name in FAULTS if name not in not_tested)
-    return AuditReport(str(sim), None if real is None else str(real), tuple(faults), tested, not_tested, left)
+    return AuditReport(str(sim), None if real is None else str(real), tuple(faults), tested, not_tested, motion_left)
 
 
 def simulator_faults(
     sim: Recording, real: Recording | None, sheet: datasheet.Noise, mounts: tuple[Mount, Mount] = (AT_BODY, AT_BODY)
 ) -> list[FaultFound]:
-    """Faults of a simulation by its own poses, and beside a recording and a data sheet.
+    """Faults of a simulation by its own poses, and against a recording and a data sheet.
 
     `mounts` have moved the poses of the one and the other.
 
@@ -109,21 +109,21 @@ def _faults(
     sim, moved, by_motion = _in_si(sim)
     fit = kinematic_fit(moved)
     samples, rate_hz = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1), 1.0 / sim.imu.period_s
-    by_motion += motion_faults(moved, fit, most_filter_delays(sim, fit))
+    by_motion += motion_faults(moved, fit, max_filter_delays(sim, fit))
     expected = [Expected.of_sheet(sheet)] if _has_noise(sheet) else []
     expected += [] if real is None else [Expected.of_recording(real.imu)]
-    left = unexplained(moved, fit, by_motion)
-    if left:  # of what is no motion of the body no delay can be told
-        by_motion = [fault for fault in by_motion if fault.fault not in TIMING or fault.signal not in (*left, "both")]
+    motion_left = unexplained(moved, fit, by_motion)
+    if motion_left:  # of what is no motion of the body no delay can be told
+        by_motion = [fault for fault in by_motion if fault.fault not in TIMING or fault.signal not in (*motion_left, "both")]
     arm = np.array([fit.estimates[axis].value for axis in AXES])
     lines_found = spectral_lines(samples, fit.residual, rate_hz, *by_differences(sim.truth, arm))
-    faults, untold = noise_faults(sim.imu, fit.residual, expected, lines_found)
+    faults, unknown_lines = noise_faults(sim.imu, fit.residual, expected, lines_found)
     if any(fault.fault == "repeated_samples" for fault in faults):  # which are late by half of the physics step
         by_motion = [fault for fault in by_motion if fault.fault not in TIMING[:2]]
     faults = by_motion + faults
     if real is not None and real.truths:
         faults += _body_centre(fit, real, mounts)
-    return faults, untold, left
+    return faults, unknown_lines, motion_left
 
 
 def _in_si(sim: Recording) -> tuple[Recording, Kinematics, list[FaultFound]]:
@@ -197,12 +197,12 @@ def _body_centre(fit: KinematicFit, real: Recording, mounts: tuple[Mount, Mount]
         moved: Kinematics = kinematics(real)
     except ImutoolError:
         return []
-    ours, theirs = (
+    own_arm, moved_arm = (
         {a: Estimate(estimates[a].value + stated, estimates[a].std, "m") for a, stated in zip(AXES, mount.arm, strict=True)}
         for estimates, mount in zip((fit.estimates, kinematic_fit(moved).estimates), mounts, strict=True)
     )
-    clear = [abs(theirs[a].value - ours[a].value) > CERTAIN * np.hypot(theirs[a].std, ours[a].std) for a in AXES]
-    sizes = [float(np.linalg.norm([arm[a].value for a in AXES])) for arm in (ours, theirs)]
-    if not any(clear) or sizes[0] > 0.2 * sizes[1] or sizes[1] < LEAST_ARM_M:
+    clear = [abs(moved_arm[a].value - own_arm[a].value) > CERTAIN * np.hypot(moved_arm[a].std, own_arm[a].std) for a in AXES]
+    sizes = [float(np.linalg.norm([arm[a].value for a in AXES])) for arm in (own_arm, moved_arm)]
+    if not any(clear) or sizes[0] > 0.2 * sizes[1] or sizes[1] < MIN_ARM_M:
         return []
-    return [found("body_centre", "accel", **theirs)]
+    return [found("body_centre", "accel", **moved_arm)]

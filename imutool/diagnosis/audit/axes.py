@@ -16,11 +16,11 @@ from imutool.array_types import Float64
 
 CLEARLY = 0.5  # of the squares of the ideal sensor, up to which another unit, frame or axes are chosen
 ALIKE = 1.1  # times the least squares: hypotheses that explain as much, of which the simplest is taken
-LEAST_TURN = 0.05  # rad, from signed axes: less is a mount's misalignment
+MIN_TURN = 0.05  # rad, from signed axes: less is a mount's misalignment
 UNSEEN = 1e-4  # of the products of signal and parts: less tells no rotation, as that about the only axis of a planar motion;
 # so rotations come out too small by up to this share
-LEAST_SEEN = 0.01  # of these products, of the axis that moves least beside a turned reflection
-MOST_BIAS = 1.0  # m/s², of the accelerometer: gravity in the world frame is none
+MIN_SEEN = 0.01  # of these products, of the axis that moves least beside a turned reflection
+MAX_BIAS = 1.0  # m/s², of the accelerometer: gravity in the world frame is none
 
 Vectors = Float64[np.ndarray, "n 3"]
 Parts = Float64[np.ndarray, "n 3 p"]
@@ -37,7 +37,7 @@ PERMUTATIONS = sorted(  # all 48 signed permutations, those that change fewest a
 class Hypotheses:
     """Parts of a motion in each frame, the right one first, of which a signal may be made.
 
-    Its bias is free, or at most `MOST_BIAS`. With `turns` its axes may be turned, too.
+    Its bias is free, or at most `MAX_BIAS`. With `turns` its axes may be turned, too.
     """
 
     frames: Mapping[str, Parts]
@@ -47,10 +47,10 @@ class Hypotheses:
     def frame(self, y: Vectors) -> tuple[str, Matrix]:
         """Frame of a signal, and its axes P: the simplest that explains as much as any."""
         squares = self._squares(y, scaled=True)
-        least = max(min(entry[0] for entry in squares), 1e-9 * float((y**2).sum()))  # an exact sensor leaves rounding
-        if least > CLEARLY * squares[0][0]:
+        minimum = max(min(entry[0] for entry in squares), 1e-9 * float((y**2).sum()))  # an exact sensor leaves rounding
+        if minimum > CLEARLY * squares[0][0]:
             return squares[0][2:]
-        chosen = min((entry for entry in squares if entry[0] <= ALIKE * least), key=lambda entry: entry[1])
+        chosen = min((entry for entry in squares if entry[0] <= ALIKE * minimum), key=lambda entry: entry[1])
         frame, P = chosen[2:]
         return frame, nearest_signed(P) if is_signed(P) else P
 
@@ -71,8 +71,8 @@ class Hypotheses:
             right, x = next(iter(self.frames.items()))
             tried.append((right, x, self._turned(y, x)))
         for frame, x, axes in tried:
-            each = zip(axes, _least(y, x, axes, free_bias=self.free_bias, scaled=scaled), strict=True)
-            out += [(left, len(out) + rank, frame, P) for rank, (P, left) in enumerate(each)]
+            each = zip(axes, _minimum(y, x, axes, free_bias=self.free_bias, scaled=scaled), strict=True)
+            out += [(squares, len(out) + rank, frame, P) for rank, (P, squares) in enumerate(each)]
         return out
 
     def _turned(self, y: Vectors, x: Parts) -> list[Matrix]:
@@ -83,7 +83,7 @@ class Hypotheses:
                 of_y, of_x = (part - part.mean(axis=0) if self.free_bias else part for part in (y, x @ np.array(weight)))
                 B = of_y.T @ of_x
                 U, seen, Vt = np.linalg.svd(B + UNSEEN * np.linalg.norm(B) * np.diag([1.0, handed, 1.0]))
-                if handed < 0.0 and seen[2] < LEAST_SEEN * seen[0]:  # a planar motion shows no reflection
+                if handed < 0.0 and seen[2] < MIN_SEEN * seen[0]:  # a planar motion shows no reflection
                     continue
                 out.append(np.asarray(U @ np.diag([1.0, 1.0, handed * np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt))
         return out
@@ -96,7 +96,7 @@ def nearest_signed(P: Matrix) -> Matrix:
 
 def is_signed(P: Matrix) -> bool:
     """Whether axes are signed ones, up to a small angle."""
-    return float(np.trace(P @ nearest_signed(P).T)) > 1.0 + 2.0 * math.cos(LEAST_TURN)
+    return float(np.trace(P @ nearest_signed(P).T)) > 1.0 + 2.0 * math.cos(MIN_TURN)
 
 
 def _weights(x: Parts) -> list[tuple[float, ...]]:
@@ -106,7 +106,7 @@ def _weights(x: Parts) -> list[tuple[float, ...]]:
     return [*((1.0, g, c) for g in (1.0, 0.0, 2.0, -1.0) for c in (0.0, 1.0)), (0.0, 1.0, 0.0)]
 
 
-def _least(y: Vectors, x: Parts, axes: Sequence[Matrix], *, free_bias: bool, scaled: bool) -> list[float]:
+def _minimum(y: Vectors, x: Parts, axes: Sequence[Matrix], *, free_bias: bool, scaled: bool) -> list[float]:
     """Least squares of y P by its parts, for each P; the first part may be `scaled`."""
     weights = _weights(x)
     flat, n, s = x.reshape(-1, x.shape[2]), len(y), float((y**2).sum())
@@ -115,14 +115,14 @@ def _least(y: Vectors, x: Parts, axes: Sequence[Matrix], *, free_bias: bool, sca
     out = []
     for P in axes:
         g, best = np.einsum("ji,jip->p", P, both.reshape(3, *x.shape[1:])), np.inf
-        ways = [np.array(weight) for weight in weights]
+        candidates = [np.array(weight) for weight in weights]
         if scaled:
             about, size = g - n * (mean_y @ P) @ mean_x, G - n * mean_x.T @ mean_x
-            free = [max(float(about[0] - size[0, 1:] @ w[1:]) / max(float(size[0, 0]), 1e-300), 0.0) for w in ways]
-            ways += [np.array([m, *w[1:]]) for m, w in zip(free, ways, strict=True) if w[0]]
-        for w in ways:
+            free = [max(float(about[0] - size[0, 1:] @ w[1:]) / max(float(size[0, 0]), 1e-300), 0.0) for w in candidates]
+            candidates += [np.array([m, *w[1:]]) for m, w in zip(free, candidates, strict=True) if w[0]]
+        for w in candidates:
             mean = mean_y @ P - mean_x @ w
-            left = 0.0 if free_bias else float(np.sum(np.maximum(np.abs(mean) - MOST_BIAS, 0.0) ** 2))
-            best = min(best, s - 2.0 * float(w @ g) + float(w @ G @ w) - n * (float(mean @ mean) - left))
+            squares = 0.0 if free_bias else float(np.sum(np.maximum(np.abs(mean) - MAX_BIAS, 0.0) ** 2))
+            best = min(best, s - 2.0 * float(w @ g) + float(w @ G @ w) - n * (float(mean @ mean) - squares))
         out.append(best)
     return out

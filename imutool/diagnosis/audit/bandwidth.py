@@ -24,39 +24,39 @@ WINDOW_BINS = 0.5  # by which a Hann window moves a cut-off up
 FOURTH_ORDER = 0.42  # of the period of its cut-off, by which a Butterworth filter of fourth order is late; of first order 0.16
 
 
-def most_filter_delays(sim: Recording, fit: KinematicFit) -> tuple[float, float]:
+def max_filter_delays(sim: Recording, fit: KinematicFit) -> tuple[float, float]:
     """Most delays (sample periods) of the sensors' filters, by their noise; 0 for white noise.
 
-    A residual counts beside poses that come as late as the sensor does: what a delay of all frequencies leaves is no noise, nor
+    A residual counts where the poses come as late as the sensor does: what a delay of all frequencies leaves is no noise, nor
     is what a mean leaves, as a difference of attitudes is one.
     """
     out = []
     for name, samples, part in (("tau_g", sim.imu.gyro, slice(0, 3)), ("tau_f", sim.imu.accel, slice(3, 6))):
-        late, left = fit.estimates[name], fit.residual[:, part]
+        late, residual = fit.estimates[name], fit.residual[:, part]
         if clear(late):
             k = kinematics(replace(sim, imu=replace(sim.imu, t_ns=sim.imu.t_ns - round(late.value * 1e9))))
             then = kinematic_fit(k)
-            left, rate = then.residual[:, part], k.rates()[then.frames[0]]
-            if name == "tau_g" and _is_mean(left, rate, k.t_s, late.value):
+            residual, rate = then.residual[:, part], k.rates()[then.frames[0]]
+            if name == "tau_g" and _is_mean(residual, rate, k.t_s, late.value):
                 out.append(0.0)
                 continue
-        out.append(most_filter_delay(left, samples))
+        out.append(max_filter_delay(residual, samples))
     return out[0], out[1]
 
 
 def _is_mean(
-    left: Float64[np.ndarray, "n 3"], rate: Float64[np.ndarray, "n 3"], t_s: Float64[np.ndarray, " n"], late_s: float
+    residual: Float64[np.ndarray, "n 3"], rate: Float64[np.ndarray, "n 3"], t_s: Float64[np.ndarray, " n"], late_s: float
 ) -> bool:
     """Whether a residual is what a mean of the rate over twice its delay leaves: tau^2 / 6 of the rate's curvature."""
     rate = rate - rate.mean(axis=0)
     bent = np.gradient(np.gradient(rate, t_s, axis=0), t_s, axis=0)
-    left, bent = (x - x.mean(axis=0) - rate * (x * rate).sum() / (rate**2).sum() for x in (left, bent))
-    size = float((left * bent).sum() / (bent**2).sum())
-    explained = size * float((left * bent).sum()) / max(float((left**2).sum()), 1e-300)
+    residual, bent = (x - x.mean(axis=0) - rate * (x * rate).sum() / (rate**2).sum() for x in (residual, bent))
+    size = float((residual * bent).sum() / (bent**2).sum())
+    explained = size * float((residual * bent).sum()) / max(float((residual**2).sum()), 1e-300)
     return explained > 0.5 and abs(6.0 * size / late_s**2 - 1.0) < MEAN_BAND
 
 
-def most_filter_delay(residual: Float64[np.ndarray, "n 3"], samples: Float64[np.ndarray, "m 3"]) -> float:
+def max_filter_delay(residual: Float64[np.ndarray, "n 3"], samples: Float64[np.ndarray, "m 3"]) -> float:
     """Most delay (sample periods) of a filter that the noise shows; 0 for white noise.
 
     Quartiles of short segments are those between two impacts.

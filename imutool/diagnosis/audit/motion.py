@@ -33,15 +33,15 @@ from imutool.units import SENSORS, Sensor
 JERK_S = 1e-3  # half of the step of a central difference
 BLOCK_S = 2.0  # of the robust covariance
 SHOWN, ORDER = 0.5, 4  # of a curve's cut-off, up to which it follows a motion to 2 %; of the filter
-LEAST_BLOCK = 4.0  # periods of the highest frequency in a block, so that blocks are independent
+MIN_BLOCK = 4.0  # periods of the highest frequency in a block, so that blocks are independent
 BANDS = (1.0, 0.5, 0.25)  # of the band that the poses show: a curve follows the slower motion better
-MOST_ALIKE = 0.98  # correlation of neighbouring blocks
+MAX_ALIKE = 0.98  # correlation of neighbouring blocks
 AGREE = 3.0  # standard deviations by which two bands may differ
 RIDGE = 1e-6  # of biases and misalignment: a body that stays level shows them and gravity alike, and gravity is the larger
 SMALL = 0.01  # rad, or a share: deviation of misalignment and scales before they are fitted
-MOST_SMALL = 0.06  # rad, or a share, that is a sensor's error: more is none of a right one
-LEAST_COSINE = 1e-3  # of the pitch, towards which rates of roll and yaw grow without bound
-LEAST_S = 5.0
+MAX_SMALL = 0.06  # rad, or a share, that is a sensor's error: more is none of a right one
+MIN_COSINE = 1e-3  # of the pitch, towards which rates of roll and yaw grow without bound
+MIN_S = 5.0
 OTHER_UNIT: Mapping[Sensor, float] = {"gyro": np.pi / 180.0, "accel": 9.80665}  # deg/s, standard gravity
 MISALIGNMENT = np.array(  # and scales of the axes: the 8 matrices of which none changes all scales alike
     [*(np.outer(a, b) for a, b in permutations(np.eye(3), 2)), np.diag([1.0, -1.0, 0.0]), np.diag([1.0, 1.0, -2.0])]
@@ -72,7 +72,7 @@ class Kinematics:
     def rates(self) -> dict[str, Vectors]:
         """Angular rate in the body, in the world, and as rates of roll, pitch and yaw (R_wb = Rz Ry Rx)."""
         (p, q, r), (s, sin_roll, cos_roll) = self.omega.T, self.R_wb[:, 2].T  # both times the cosine of the pitch, -s its sine
-        level = np.maximum(np.hypot(sin_roll, cos_roll), LEAST_COSINE)
+        level = np.maximum(np.hypot(sin_roll, cos_roll), MIN_COSINE)
         yaw = (q * sin_roll + r * cos_roll) / level**2
         euler = np.stack([p - s * yaw, (q * cos_roll - r * sin_roll) / level, yaw], axis=1)
         return {"body": self.omega, "world": np.einsum("nij,nj->ni", self.R_wb, self.omega), "euler": euler}
@@ -110,14 +110,14 @@ def kinematics(log: Recording) -> Kinematics:
             j_w = (after.a_w - before.a_w) / (2.0 * JERK_S)
             parts.append([R_wb, at.omega_b, at.alpha_b, at.v_w, at.a_w, j_w])
             used |= rows
-    if used.sum() < LEAST_S / imu.period_s:
+    if used.sum() < MIN_S / imu.period_s:
         raise DataError(
-            "its poses cover too little", where=log.name, expected=f"{LEAST_S:g} s of poses without a hole or an impact"
+            "its poses cover too little", where=log.name, expected=f"{MIN_S:g} s of poses without a hole or an impact"
         )
     t_s = np.asarray((imu.t_ns[used] - imu.t_ns[used][0]) * 1e-9, dtype=np.float64)
     R_wb, omega, alpha, v_w, a_w, j_w = (np.concatenate(each) for each in zip(*parts, strict=True))
     longest = max(motion.stretches, key=lambda stretch: stretch.duration_s)
-    band_hz = max(SHOWN * min(longest.cutoff_hz), LEAST_BLOCK / BLOCK_S)
+    band_hz = max(SHOWN * min(longest.cutoff_hz), MIN_BLOCK / BLOCK_S)
     return Kinematics(
         t_s, imu.gyro[used], imu.accel[used], R_wb, omega, alpha, v_w, a_w, j_w, period_s=imu.period_s, band_hz=band_hz
     )
@@ -150,8 +150,8 @@ def kinematic_fit(k: Kinematics) -> KinematicFit:
 
 def units(k: Kinematics) -> dict[Sensor, float]:
     """Factor of each sensor's samples: 1, or what makes rad/s of deg/s and m/s² of g."""
-    samples, ways = {"gyro": k.gyro, "accel": k.accel}, {"gyro": _of_gyro(k), "accel": _of_accel(k, _force_parts(k))}
-    return {sensor: ways[sensor].unit(k.shown(samples[sensor]), OTHER_UNIT[sensor]) for sensor in SENSORS}
+    samples, columns = {"gyro": k.gyro, "accel": k.accel}, {"gyro": _of_gyro(k), "accel": _of_accel(k, _force_parts(k))}
+    return {sensor: columns[sensor].unit(k.shown(samples[sensor]), OTHER_UNIT[sensor]) for sensor in SENSORS}
 
 
 def _force_parts(k: Kinematics) -> Float64[np.ndarray, "n 3 3"]:
@@ -184,17 +184,17 @@ def _solved(
     """
     p = x.shape[2]
     whole, target = np.concatenate([x, np.tile(np.eye(3), (len(y), 1, 1)), small], axis=2), y - x @ ideal
-    bands = sorted({max(share * k.band_hz, LEAST_BLOCK / BLOCK_S) for share in BANDS}, reverse=True)
+    bands = sorted({max(share * k.band_hz, MIN_BLOCK / BLOCK_S) for share in BANDS}, reverse=True)
     each = [_in_band(replace(k, band_hz=band_hz), target, whole, p) for band_hz in bands]
     theta, std = (np.array(values) for values in zip(*each, strict=True))
     square = (np.array(bands)[:, None] / bands[0]) ** 2
     with np.errstate(invalid="ignore"):  # of parts that the motion does not show, whose deviation is infinite
         by_chance = AGREE * np.sqrt(np.maximum(std**2 - std[0] ** 2, 0.0))
-    apart = np.abs(theta - theta[0])
-    error = np.max(np.where(apart > by_chance, apart, 0.0)[1:] / (1.0 - square[1:]), axis=0, initial=0.0)
+    change = np.abs(theta - theta[0])
+    error = np.max(np.where(change > by_chance, change, 0.0)[1:] / (1.0 - square[1:]), axis=0, initial=0.0)
     total = np.hypot(std, square * error)
     best = total.argmin(axis=0), np.arange(len(total[0]))
-    taken = np.concatenate([theta[0, : p + 3], np.clip(theta[0, p + 3 :], -MOST_SMALL, MOST_SMALL)])
+    taken = np.concatenate([theta[0, : p + 3], np.clip(theta[0, p + 3 :], -MAX_SMALL, MAX_SMALL)])
     return ideal + theta[best][:p], total[best][:p], np.asarray(target - whole @ taken)
 
 
@@ -212,12 +212,12 @@ def _in_band(
     for _ in range(3):
         H = (A * weight[:, None, None]).reshape(-1, q).T @ A.reshape(-1, q) + ridge
         theta = np.linalg.solve(H, np.einsum("n,nap,na->p", weight, A, target))
-        left = target - A @ theta
-        length = np.sqrt((left**2).sum(axis=1))
+        residual = target - A @ theta
+        length = np.sqrt((residual**2).sum(axis=1))
         weight = 1.0 / np.maximum(1.0, length / max(3.0 * float(np.median(length)), 1e-12))
         variance = alike * float((weight * length**2).sum()) / (3.0 * float(weight.sum()))
         ridge[small, small] = RIDGE + variance / (SMALL * size[small]) ** 2
-    half = np.linalg.solve(H, by_block(k, np.einsum("n,nap,na->np", weight, A, left)).T)
+    half = np.linalg.solve(H, by_block(k, np.einsum("n,nap,na->np", weight, A, residual)).T)
     std = of_sum(half) / size
     std[~np.isfinite(size)] = np.inf
     return theta / size, std
@@ -234,5 +234,5 @@ def by_block(k: Kinematics, x: Float64[np.ndarray, "n p"]) -> Float64[np.ndarray
 def of_sum(blocks: Float64[np.ndarray, "p b"]) -> Float64[np.ndarray, " p"]:
     """Deviation of a sum over blocks, which as in a first-order autoregression may be alike."""
     square, n = (blocks**2).sum(axis=1), blocks.shape[1]
-    alike = np.clip((blocks[:, 1:] * blocks[:, :-1]).sum(axis=1) / np.maximum(square, 1e-300), 0.0, MOST_ALIKE)
+    alike = np.clip((blocks[:, 1:] * blocks[:, :-1]).sum(axis=1) / np.maximum(square, 1e-300), 0.0, MAX_ALIKE)
     return np.asarray(np.sqrt(square * (1.0 + alike) / (1.0 - alike) * n / max(n - 2, 1)))

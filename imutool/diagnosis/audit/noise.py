@@ -12,7 +12,7 @@ from scipy.signal import spectrogram
 from scipy.stats import gamma
 
 from imutool.array_types import Float64
-from imutool.diagnosis.audit.bandwidth import bandwidth_faults, most_filter_delay
+from imutool.diagnosis.audit.bandwidth import bandwidth_faults, max_filter_delay
 from imutool.diagnosis.audit.faults import FaultFound, found
 from imutool.diagnosis.audit.spectral_lines import HANN, SpectralLine
 from imutool.diagnosis.estimation.timestamps import grid, limits
@@ -35,7 +35,7 @@ CONSEQUENCES = {
     "clipping_absent": ("bandwidth_absent", "noise_density"),
     "bandwidth_absent": ("noise_density", "noise_per_sample"),
 }
-LEAST_LSB = 0.3  # of the noise: finer digits leave no trace
+MIN_LSB = 0.3  # of the noise: finer digits leave no trace
 SEGMENT, SHORT = 1024, (32, 16)  # samples
 QUARTILE = 0.674  # of a normal distribution, in deviations
 REPEATED = 0.08  # of the samples
@@ -76,14 +76,14 @@ class Expected:
         if self.samples is None:
             return False
         part = self.samples[:, 3 * SENSORS.index(sensor) : 3 * SENSORS.index(sensor) + 3]
-        return most_filter_delay(part, part) > 0.0
+        return max_filter_delay(part, part) > 0.0
 
     def sample(self, sensor: Sensor, rate_hz: float) -> tuple[float, float]:
         """Least and most noise of a sample at a rate; digits add to the noise of a recording."""
         part = slice(3 * SENSORS.index(sensor), 3 * SENSORS.index(sensor) + 3)
         density, lsb = float(np.nanmedian(self.density[part])), float(np.median(self.lsb[part]))
-        least = _without_digits(density * np.sqrt(self.rate_hz or rate_hz), lsb) / np.sqrt(self.rate_hz or rate_hz)
-        return least * np.sqrt(rate_hz), density * np.sqrt(rate_hz)
+        minimum = _without_digits(density * np.sqrt(self.rate_hz or rate_hz), lsb) / np.sqrt(self.rate_hz or rate_hz)
+        return minimum * np.sqrt(rate_hz), density * np.sqrt(rate_hz)
 
 
 def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float, lsb: Column | float = 0.0) -> Column:
@@ -137,7 +137,7 @@ def noise_faults(
         lsb = np.array([grid(column) for column in samples[:, part].T])
         own = float(np.median(fast_noise(residual[:, part], rate_hz, lsb)))
         noise = _without_digits(own, float(np.median(lsb))), own
-        filters = most_filter_delay(residual[:, part], samples[:, part]) > 0.0
+        filters = max_filter_delay(residual[:, part], samples[:, part]) > 0.0
         for reference in expected:
             density = _density(sensor, noise, rate_hz, reference)
             comparable = filters == reference.filters(sensor)  # what a filter leaves at high frequency is no density
@@ -148,8 +148,8 @@ def noise_faults(
                 out += _digits(sensor, samples[:, part], reference.samples[:, part])
                 sims = (residual[:, part], samples[:, part])
                 out += bandwidth_faults(sensor, sims, rate_hz, reference.samples[:, part], reference.rate_hz)
-    untold = [line for line in lines if line.cause == "unknown" and not _follows("step_lines", line.sensor, out)]
-    return [fault for fault in out if not _follows(fault.fault, fault.signal, out)], untold
+    unknown = [line for line in lines if line.cause == "unknown" and not _follows("step_lines", line.sensor, out)]
+    return [fault for fault in out if not _follows(fault.fault, fault.signal, out)], unknown
 
 
 def _follows(fault: str, signal: str, others: list[FaultFound]) -> bool:
@@ -159,15 +159,15 @@ def _follows(fault: str, signal: str, others: list[FaultFound]) -> bool:
 
 def _density(sensor: Sensor, noise: tuple[float, float], rate_hz: float, expected: Expected) -> Iterator[FaultFound]:
     """Noise absent, of a sample at another rate (or a density taken for a sample's), or of another density."""
-    (least, most), own = expected.sample(sensor, rate_hz), noise[1]
-    if not most > 0.0:
+    (minimum, maximum), own = expected.sample(sensor, rate_hz), noise[1]
+    if not maximum > 0.0:
         return
-    ratio = max(noise[0] / most, 1.0) * min(own / max(least, 1e-300), 1.0)
-    numbers = {"noise": Estimate(own, 0.02 * own, UNITS[sensor]), "expected": Estimate(most, 0.0, UNITS[sensor])}
+    ratio = max(noise[0] / maximum, 1.0) * min(own / max(minimum, 1e-300), 1.0)
+    numbers = {"noise": Estimate(own, 0.02 * own, UNITS[sensor]), "expected": Estimate(maximum, 0.0, UNITS[sensor])}
     real_hz = expected.rate_hz
-    meant = most / np.sqrt(rate_hz) * (1.0 if real_hz is None else np.sqrt(real_hz))  # a sample's, as it was given
+    meant = maximum / np.sqrt(rate_hz) * (1.0 if real_hz is None else np.sqrt(real_hz))  # a sample's, as it was given
     other_rate = real_hz is None or max(real_hz / rate_hz, rate_hz / real_hz) > OTHER_RATE
-    if own / most < ABSENT and max(meant / max(own, 1e-300), 1.0) > SAME_SAMPLE**2:
+    if own / maximum < ABSENT and max(meant / max(own, 1e-300), 1.0) > SAME_SAMPLE**2:
         yield found("noise_absent", sensor, **numbers)
     elif other_rate and 1.0 / SAME_SAMPLE < own / meant < SAME_SAMPLE:
         yield found("noise_per_sample", sensor, **numbers)
@@ -197,10 +197,10 @@ def _walk(
         return
     squares = dct(residual, axis=0, norm="ortho")[k] ** 2 / max(own, 1e-300) ** 2
     weighed = float((squares / (1.0 + ratio) * ratio).sum())
-    least = minimize_scalar(lambda s: np.exp(s) * weighed - 0.5 * np.log1p(2.0 * np.exp(s) * ratio).sum(), bracket=(-10.0, 0.0))
+    best = minimize_scalar(lambda s: np.exp(s) * weighed - 0.5 * np.log1p(2.0 * np.exp(s) * ratio).sum(), bracket=(-10.0, 0.0))
     smaller = ratio * WALK_SHARES[:, None, None] ** 2
     walks = 0.5 * (squares * smaller / (1.0 + smaller) - np.log1p(smaller)).sum(axis=(1, 2)).max()  # log likelihood over none
-    if float(least.fun) < np.log(WALK_P_VALUE) and walks < WALKS:
+    if float(best.fun) < np.log(WALK_P_VALUE) and walks < WALKS:
         density = float(np.median(walk))
         yield found("bias_never_walks", sensor, expected_walk=Estimate(density, 0.0, f"{UNITS[sensor]}/s/√Hz"))
 
@@ -216,7 +216,7 @@ def _digits(sensor: Sensor, sim: Float64[np.ndarray, "n 3"], real: Float64[np.nd
     """Digits that the recording has and the simulation lacks."""
     steps = [grid(column) for column in real.T]
     lsb = float(np.median(steps))
-    if min(steps) > LEAST_LSB * float(np.median(fast_noise(real, 1.0))) and all(grid(column) < 0.5 * lsb for column in sim.T):
+    if min(steps) > MIN_LSB * float(np.median(fast_noise(real, 1.0))) and all(grid(column) < 0.5 * lsb for column in sim.T):
         yield found("digits_absent", sensor, lsb=Estimate(lsb, 1e-3 * lsb, UNITS[sensor]))
 
 

@@ -26,10 +26,10 @@ Cause = Literal["motion", "sensor", "unknown"]
 P_VALUE = 1e-9
 AROUND = (31, 13)  # bins whose medians a line exceeds: a hump is wider
 ABOVE = 3.0  # times these medians
-LEAST: dict[Sensor, float] = {"gyro": 1e-5, "accel": 1e-4}  # amplitude, rad/s and m/s²: less is rounding
+MIN: dict[Sensor, float] = {"gyro": 1e-5, "accel": 1e-4}  # amplitude, rad/s and m/s²: less is rounding
 STEADY = 0.45  # of its mean, the scatter of a line from segment to segment; of noise on three axes 0.58
 HANN = 1.5  # bins of noise in one of a Hann window
-LEAST_SHARE, MOST_SHARE = 0.15, 0.495  # of the rate: below, motion is left
+MIN_SHARE, MAX_SHARE = 0.15, 0.495  # of the rate: below, motion is left
 SEGMENT = 1024
 KNOWN_SHARE = 0.45  # of the poses' rate, up to which they show a motion
 CLEARLY = 4.0  # times the power of the poses' differences, that a line of this motion would have
@@ -83,45 +83,45 @@ def spectral_lines(
     """
     size = min(SEGMENT, len(residual) // 4)
     out: list[SpectralLine] = []
-    told: tuple[Cause, Cause] = ("sensor", "unknown")
+    cause_names: tuple[Cause, Cause] = ("sensor", "unknown")
     for k, sensor in enumerate(SENSORS):
         part = slice(3 * k, 3 * k + 3)
-        left, whole = (_spectrum(x[:, part], rate_hz, size) for x in (residual, samples))
+        found, whole = (_spectrum(x[:, part], rate_hz, size) for x in (residual, samples))
         poses = _spectrum(shown[:, part], poses_hz, min(round(size * poses_hz / rate_hz), len(shown)))
         by_poses, width_hz = Shown(poses, poses_hz, order=2 * k + 2), rate_hz / size
-        above = (left.f_hz > LEAST_SHARE * rate_hz) & (left.f_hz < MOST_SHARE * rate_hz)
-        above &= np.sqrt(2.0 * HANN * left.power * width_hz) > LEAST[sensor]
-        lines = np.flatnonzero(above & left.certain & left.steady & (np.minimum(left.ratio, whole.ratio) > ABOVE))
-        strongest = lines[np.argsort(-left.ratio[lines])]
-        peak = maximum_filter1d(left.power, 5)  # as `Shown.at` looks for it
-        each = [(float(left.f_hz[line]), rate_hz, float(peak[line]), by_poses) for line in strongest]
+        above = (found.f_hz > MIN_SHARE * rate_hz) & (found.f_hz < MAX_SHARE * rate_hz)
+        above &= np.sqrt(2.0 * HANN * found.power * width_hz) > MIN[sensor]
+        lines = np.flatnonzero(above & found.certain & found.steady & (np.minimum(found.ratio, whole.ratio) > ABOVE))
+        strongest = lines[np.argsort(-found.ratio[lines])]
+        peak = maximum_filter1d(found.power, 5)  # as `Shown.at` looks for it
+        each = [(float(found.f_hz[line]), rate_hz, float(peak[line]), by_poses) for line in strongest]
         causes = [_cause(*line) for line in each]
         if "motion" in causes:  # a body that moves in lines has harmonics, too
             causes = [
                 cause if cause != "sensor" or not _is_hidden(*line) else "unknown"
                 for cause, line in zip(causes, each, strict=True)
             ]
-        first = next((cause for cause in told if cause in causes), None)
+        first = next((cause for cause in cause_names if cause in causes), None)
         if first is not None:
-            out.append(SpectralLine(sensor, float(left.f_hz[strongest[causes.index(first)]]), width_hz, first))
+            out.append(SpectralLine(sensor, float(found.f_hz[strongest[causes.index(first)]]), width_hz, first))
     return out
 
 
 def _cause(f_hz: float, rate_hz: float, power: float, shown: Shown) -> Cause:
     """What a line comes from: the poses show it, or nothing as large, or cannot show it."""
-    near, expected, there = shown.at(f_hz, power)
+    near, expected, power_shown = shown.at(f_hz, power)
     if (near & shown.lines).any():
         return "motion"
     for folded_hz in (rate_hz - f_hz, rate_hz + f_hz):
         near, weaker, other = shown.at(folded_hz, power)
         if (near & shown.lines).any() and weaker / CLEARLY < other < CLEARLY * weaker:
             return "motion"
-    return "sensor" if f_hz < KNOWN_SHARE * shown.rate_hz and expected > CLEARLY * there else "unknown"
+    return "sensor" if f_hz < KNOWN_SHARE * shown.rate_hz and expected > CLEARLY * power_shown else "unknown"
 
 
 def _is_hidden(f_hz: float, rate_hz: float, power: float, shown: Shown) -> bool:
     """Whether the poses would not show a line, were it the fold of a faster motion."""
-    return any(weaker < CLEARLY * there for _, weaker, there in (shown.at(f, power) for f in (rate_hz - f_hz, rate_hz + f_hz)))
+    return any(weaker < CLEARLY * line for _, weaker, line in (shown.at(f, power) for f in (rate_hz - f_hz, rate_hz + f_hz)))
 
 
 def _spectrum(x: Float64[np.ndarray, "n 3"], rate_hz: float, size: int) -> Spectrum:

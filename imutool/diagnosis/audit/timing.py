@@ -10,8 +10,8 @@ from imutool.diagnosis.audit.faults import FaultFound, found
 from imutool.diagnosis.result import Estimate
 
 CERTAIN = 6.0  # standard deviations
-LEAST_DELAY = 0.05  # of a sample period: less is rounding
-LEAST_GYRO_DELAY = 0.3  # of a sample period: half of a finer step is that of a semi-implicit integrator
+MIN_DELAY = 0.05  # of a sample period: less is rounding
+MIN_GYRO_DELAY = 0.3  # of a sample period: half of a finer step is that of a semi-implicit integrator
 HALF = 0.6  # of a delay by one step: half of it, and errors
 PART, WHOLE = 0.7, 0.8  # of a sample period: up to the one a delay is a part, from the other a whole step
 NEAR = 0.15  # of a step, or of gravity, by which a number may differ from a whole one
@@ -30,10 +30,10 @@ def timing_faults(estimates: Mapping[str, Estimate], period_s: float, filters: t
     gyro = _after_filter(gyro, filters[0] * period_s)
     if accel.value < attitude.value + CERTAIN * np.hypot(accel.std, attitude.std):  # a filter makes gravity late, too
         accel, attitude = (_after_filter(tau, filters[1] * period_s) for tau in (accel, attitude))
-    steps = {"gyro": _delay(gyro, period_s, LEAST_GYRO_DELAY), "accel": _delay(accel, period_s, LEAST_DELAY)}
+    steps = {"gyro": _delay(gyro, period_s, MIN_GYRO_DELAY), "accel": _delay(accel, period_s, MIN_DELAY)}
     together = abs(accel.value - attitude.value) < 3.0 * np.hypot(accel.std, attitude.std) + NEAR * period_s
     whole = together and steps["accel"] in ("step_delay", "early_stamps")
-    if abs(attitude.value) >= LEAST_DELAY * period_s and clear(attitude) and _is_late_alike(accel, attitude):
+    if abs(attitude.value) >= MIN_DELAY * period_s and clear(attitude) and _is_late_alike(accel, attitude):
         whole = together = True
         name = "step_delay" if attitude.value > 0.0 else "early_stamps"
         late_alike = {"accel": accel, **({"gyro": gyro} if clear(gyro) else {})}
@@ -41,7 +41,7 @@ def timing_faults(estimates: Mapping[str, Estimate], period_s: float, filters: t
     after_gyro = Estimate(accel.value - gyro.value, float(np.hypot(accel.std, gyro.std)), "-")
     explained = abs(gyro.value) < PART * period_s and abs(after_gyro.value) < PART * period_s  # it makes no whole step
     if explained and (steps["gyro"] != steps["accel"] or not steps["accel"]) and not whole:
-        accel, steps["accel"] = after_gyro, _delay(after_gyro, period_s, LEAST_DELAY)
+        accel, steps["accel"] = after_gyro, _delay(after_gyro, period_s, MIN_DELAY)
     late = {"gyro": gyro, "accel": accel}
     out = []
     for name in ("step_delay", "early_stamps"):
@@ -63,17 +63,17 @@ def _is_late_alike(tau: Estimate, attitude: Estimate) -> bool:
     return abs(tau.value - attitude.value) < HALF * abs(attitude.value) + 3.0 * tau.std
 
 
-def _delay(tau: Estimate, period_s: float, least: float) -> str:
+def _delay(tau: Estimate, period_s: float, minimum: float) -> str:
     """Name of a delay: half a step or less, a whole step, a step early; empty for none or another."""
     steps = tau.value / period_s if clear(tau) else 0.0
     if abs(steps) > WHOLE:
         return "step_delay" if steps > 0.0 else "early_stamps"
-    return "backward_difference" if least <= steps < PART else ""
+    return "backward_difference" if minimum <= steps < PART else ""
 
 
-def _after_filter(tau: Estimate, most_s: float) -> Estimate:
+def _after_filter(tau: Estimate, max_s: float) -> Estimate:
     """A delay that the sensor's own filter does not explain."""
-    return Estimate(0.0, tau.std, tau.unit) if 0.0 < tau.value <= most_s else tau
+    return Estimate(0.0, tau.std, tau.unit) if 0.0 < tau.value <= max_s else tau
 
 
 def clear(estimate: Estimate, ideal: float = 0.0) -> bool:

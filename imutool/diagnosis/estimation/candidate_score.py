@@ -25,7 +25,7 @@ from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect, Stage, Theta
 
 FILTERS = Stage.MOUNT, Stage.BANDWIDTH
-UNSURE = 0.5  # of a score, by which derivatives beside an earlier fit may be wrong
+UNSURE = 0.5  # of a score, by which derivatives given an earlier fit may be wrong
 UNLIKELY = -3.0  # log p-value above which they need not be right
 CLOCK = "clock_skew", "clock_jump"
 KEPT = 2  # sets of derivatives: with an effect, and without it
@@ -59,7 +59,7 @@ class _Linear(NamedTuple):
     N: Float64[np.ndarray, "p p"]
 
     def short(self) -> _Linear:
-        """The same in half of the memory, to guess scores beside other fits."""
+        """The same in half of the memory, to guess scores given other fits."""
         half, rows = np.float32, self.rows
         return self._replace(rows=[(k, js, b.astype(half), x if x is None else x.astype(half)) for k, js, b, x in rows])
 
@@ -67,15 +67,15 @@ class _Linear(NamedTuple):
 class CandidateScore:
     """Normal equations of a fit, to which the Schur complement of one more effect is added."""
 
-    def __init__(self, logs: Sequence[WhitenedLog], now: Fit) -> None:
-        self.logs, self.now = logs, now
-        _, std = priors(now.chosen, now.settings)  # without it two curves of one axis, which share a constant, are singular
+    def __init__(self, logs: Sequence[WhitenedLog], base: Fit) -> None:
+        self.logs, self.now = logs, base
+        _, std = priors(base.chosen, base.settings)  # without it two curves of one axis, which share a constant, are singular
         self.N, self.g, self.total, self.axes = np.diag(1.0 / std**2), np.zeros(len(std)), 0.0, []
         for number, log in enumerate(logs):
-            mask, residual = log.rows("fitted"), now.residuals[number]
+            mask, residual = log.rows("fitted"), base.residuals[number]
             fitted = np.flatnonzero(mask)
             for k in range(log.pair.columns):
-                where, A = now.jacobians.on_axis(number, k, np.ones(len(mask), bool))
+                where, A = base.jacobians.on_axis(number, k, np.ones(len(mask), bool))
                 axis = _Axis(fitted, direction(log.constants[fitted, k]), where, A, residual[:, k])
                 axis = axis._replace(A=axis.free(A), r=axis.free(residual[:, k]))
                 self.axes.append(axis)
@@ -83,11 +83,11 @@ class CandidateScore:
                 self.g[where] += axis.A @ axis.r
                 self.total += float(axis.r @ axis.r)
         self.solved_g = np.linalg.solve(self.N, self.g)
-        self.left = self.total - float(self.g @ self.solved_g)
+        self.remaining = self.total - float(self.g @ self.solved_g)
         self.short = [axis.short() for axis in self.axes]
 
     def linear(self, effect: Effect, begun: Chosen) -> _Linear:
-        """Derivatives of a candidate beside the fit, and what it adds where it has begun."""
+        """Derivatives of a candidate given the fit, and what it adds where it has begun."""
         start = begun[-1][1]
         rows, N = [], np.diag(1.0 / priors(((effect, start),), self.now.settings)[1] ** 2)
         for k, (log, forward) in enumerate(zip(self.logs, self.now.passes, strict=True)):
@@ -126,7 +126,7 @@ class CandidateScore:
         except np.linalg.LinAlgError:  # of a log against itself, float32 rows of 1e7 leave S singular
             step = np.linalg.lstsq(S, g)[0]
         far = float(np.abs(step[[parameter.positive for parameter in effect.parameters]]).max(initial=1.0))
-        return float(self.left - total + g_a @ solved_g + (2.0 / far - 1.0 / far**2) * (g @ step))
+        return float(self.remaining - total + g_a @ solved_g + (2.0 / far - 1.0 / far**2) * (g @ step))
 
 
 class Scored(NamedTuple):
@@ -144,7 +144,7 @@ class Scored(NamedTuple):
 
 
 class Candidates:
-    """Candidate effects with the starts of their fits, and their scores beside a fit."""
+    """Candidate effects with the starts of their fits, and their scores given a fit."""
 
     def __init__(self, logs: Sequence[WhitenedLog], effects: Sequence[Effect]) -> None:
         self.logs = logs
@@ -176,17 +176,17 @@ class Candidates:
         """
         return log_p_value(gain, len(effect.parameters)) + self.log_choices[effect.key]
 
-    def ranked(self, now: Fit, candidates: Sequence[Effect], count: int | None = None) -> list[Scored]:
-        """Candidates beside a fit by their score, each from its best start: at least the `count` best of them.
+    def ranked(self, base: Fit, candidates: Sequence[Effect], count: int | None = None) -> list[Scored]:
+        """Candidates given a fit by their score, each from its best start: at least the `count` best of them.
 
         Derivatives change little from fit to fit with the same filters (a mount that rings, a low pass), so those of an earlier
         one tell which candidates need new ones: all whose score might be among the best if it were twice as good.
         """
-        if self.score is None or self.score.now is not now:
-            self.score, self.scores = CandidateScore(self.logs, now), {}
-        derived = self._derived(now)
-        allowed = [effect for effect in candidates if may_act(effect, now.keys)]
-        allowed = [effect for effect in allowed if not any(exclude_each_other(effect, other) for other, _ in now.chosen)]
+        if self.score is None or self.score.now is not base:
+            self.score, self.scores = CandidateScore(self.logs, base), {}
+        derived = self._derived(base)
+        allowed = [effect for effect in candidates if may_act(effect, base.keys)]
+        allowed = [effect for effect in allowed if not any(exclude_each_other(effect, other) for other, _ in base.chosen)]
         self._derive(self.score, [effect for effect in allowed if effect.key not in {**derived, **self.scores}], derived)
         guesses = [(-np.inf if count is None else self._guess(self.score, effect, derived).log_p, effect) for effect in allowed]
         best, enough = list[Scored](), max(count or 0, 1)
@@ -198,24 +198,24 @@ class Candidates:
             insort(best, self.scores[effect.key], key=attrgetter("log_p"))
         return best
 
-    def jump_on_trend(self, now: Fit, best: Fit, named: Sequence[Effect], threshold: float) -> Fit:
+    def jump_on_trend(self, base: Fit, best: Fit, named: Sequence[Effect], threshold: float) -> Fit:
         """The better of a fit with one more effect and a clock that runs fast and jumps.
 
         Each of the two alone is misplaced where the other acts.
         """
         clock = {effect.name: effect for effect in named if effect.name in CLOCK}
         first = best.chosen[-1][0].name
-        if len(clock) < len(CLOCK) or first not in CLOCK or any(effect.name in (*CLOCK, WANDER) for effect, _ in now.chosen):
+        if len(clock) < len(CLOCK) or first not in CLOCK or any(effect.name in (*CLOCK, WANDER) for effect, _ in base.chosen):
             return best
         skew, jump = (clock[name] for name in CLOCK)
         both = (skew, skew.null_value.astype(float)), (jump, self.starts[jump.key][-1])
-        trial = fit(self.logs, (*now.chosen, *both), near=now)
+        trial = fit(self.logs, (*base.chosen, *both), near=base)
         second = jump if first == skew.name else skew
         return trial if self.log_p(second, best.objective - trial.objective) < threshold else best
 
-    def _derived(self, now: Fit) -> dict[str, list[_Linear]]:
-        """Candidates derived beside fits with the same filters; those of the last few such sets are kept."""
-        filters = frozenset(effect.key for effect, _ in now.chosen if effect.stage in FILTERS and not effect.linear)
+    def _derived(self, base: Fit) -> dict[str, list[_Linear]]:
+        """Candidates derived given fits with the same filters; those of the last few such sets are kept."""
+        filters = frozenset(effect.key for effect, _ in base.chosen if effect.stage in FILTERS and not effect.linear)
         derived = self.linear.pop(filters, {})
         while len(self.linear) >= KEPT:
             self.linear.pop(next(iter(self.linear)))
@@ -223,7 +223,7 @@ class Candidates:
         return derived
 
     def _derive(self, score: CandidateScore, effects: Sequence[Effect], derived: dict[str, list[_Linear]]) -> None:
-        """Derive candidates beside the fit, and score them; of the first stages, which take longest, each process gets half."""
+        """Derive candidates given the fit, and score them; of the first stages, which take longest, each process gets half."""
         slowest = sorted(effects, key=lambda effect: effect.stage)
         order = [*slowest[::2], *slowest[1::2]]
 
@@ -238,7 +238,7 @@ class Candidates:
             derived[effect.key], self.scores[effect.key] = short, Scored(log_p, effect, start, gain)
 
     def _guess(self, score: CandidateScore, effect: Effect, derived: Mapping[str, Sequence[_Linear]]) -> Scored:
-        """Score with derivatives beside an earlier fit."""
+        """Score with derivatives given an earlier fit."""
         return self.scores[effect.key] if effect.key in self.scores else self._best(score, effect, derived[effect.key])
 
     def _best(self, score: CandidateScore, effect: Effect, linear: Sequence[_Linear]) -> Scored:

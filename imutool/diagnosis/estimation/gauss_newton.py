@@ -120,16 +120,16 @@ def fit(
     """
     problem = _Problem(logs, begun, part, hold_onsets)
     iterations = problem.settings.iterations if iterations is None else iterations
-    now = _descended(problem, problem.state(begun, near), iterations, near, give_up_above)
+    base = _descended(problem, problem.state(begun, near), iterations, near, give_up_above)
     if iterations and any(effect.jumps for effect, _ in begun):
-        now = _descended(problem, _polished(problem, now), iterations, None, np.inf)
-    passes, residuals, numbers = tuple(now.passes), tuple(now.residuals), sum(log.count(part) for log in logs)
-    return Fit(now.chosen, now.bias, now.objective, numbers, tuple(logs), part, passes, residuals, problem.std)
+        base = _descended(problem, _polished(problem, base), iterations, None, np.inf)
+    passes, residuals, numbers = tuple(base.passes), tuple(base.residuals), sum(log.count(part) for log in logs)
+    return Fit(base.chosen, base.bias, base.objective, numbers, tuple(logs), part, passes, residuals, problem.std)
 
 
 def without_effects(found: Fit, left_out: Collection[int], always: int) -> Chosen:
     """Effects of a fit without some; those that are always fitted take over what they can."""
-    others = tuple(one for k, one in enumerate(found.chosen) if k not in left_out)
+    others = tuple(pair for k, pair in enumerate(found.chosen) if k not in left_out)
     return fit(found.logs, others, part=found.part, near=found).chosen if always else others
 
 
@@ -169,10 +169,10 @@ class _Problem:
                 total += float(r @ r + (b / prior) ** 2)
         return _State(chosen, passes, residuals, bias, total)
 
-    def step(self, jacobians: Jacobians, now: _State) -> tuple[Theta, float]:
+    def step(self, jacobians: Jacobians, base: _State) -> tuple[Theta, float]:
         """Gauss-Newton step of free parameters, and the gain of the whole step; onsets stay."""
-        N, g = _normal(self, jacobians, now.residuals, now.bias)
-        x, parameters = free_of(now.chosen), parameters_of(now.chosen)
+        N, g = _normal(self, jacobians, base.residuals, base.bias)
+        x, parameters = free_of(base.chosen), parameters_of(base.chosen)
         N[: len(x), : len(x)] += np.diag(1.0 / self.std**2)
         g[: len(x)] -= (x - self.mean) / self.std**2
         begins = np.array([parameter.begins for parameter in parameters], bool)
@@ -195,36 +195,36 @@ class _Problem:
         return missed <= self.settings.jacobian_error**2 * max(length, 1.0)
 
 
-def _descended(problem: _Problem, now: _State, iterations: int, near: Fit | None, give_up_above: float) -> _State:
+def _descended(problem: _Problem, base: _State, iterations: int, near: Fit | None, give_up_above: float) -> _State:
     """State after Gauss-Newton steps, each shortened until the objective falls."""
     settings, whiteners, steps = problem.settings, [log.whiten for log in problem.logs], 0
     kept = None if near is None or not len(problem.mean) or not iterations else near.jacobians
-    hopeless = np.inf if near is None else _hopeless(now.chosen, near, give_up_above)
+    hopeless = np.inf if near is None else _hopeless(base.chosen, near, give_up_above)
     while len(problem.mean) and steps < iterations:
-        before = now.objective
-        for moved in _onsets(problem, now) if steps else ():  # where it begins is best known until all else has moved once
-            now = min(now, problem.state(moved, now), key=_objective)
-        jacobians = Jacobians(whiteners, now.passes, now.chosen, kept)
-        x, (whole, gain) = free_of(now.chosen), problem.step(jacobians, now)
+        before = base.objective
+        for moved in _onsets(problem, base) if steps else ():  # where it begins is best known until all else has moved once
+            base = min(base, problem.state(moved, base), key=_objective)
+        jacobians = Jacobians(whiteners, base.passes, base.chosen, kept)
+        x, (whole, gain) = free_of(base.chosen), problem.step(jacobians, base)
         if not steps and before - gain >= hopeless:
             break
         tries = (
-            (step, problem.state(_bound(now.chosen, x + step), now))
+            (step, problem.state(_bound(base.chosen, x + step), base))
             for step in (whole * 0.5**k for k in range(settings.backtracks))
         )
-        step, better = next((taken for taken in tries if taken[1].objective < now.objective), (x, now))
-        if better is now:
+        step, better = next((taken for taken in tries if taken[1].objective < base.objective), (x, base))
+        if better is base:
             if jacobians.fresh:
                 break
             kept = None
             continue
-        predicted = problem.as_predicted(jacobians, now, better, step)
-        now, steps = better, steps + 1
-        converged = before - now.objective < settings.converged_squares and (jacobians.fresh or predicted)
-        if converged or (steps == settings.patience_steps and now.objective >= give_up_above):
+        predicted = problem.as_predicted(jacobians, base, better, step)
+        base, steps = better, steps + 1
+        converged = before - base.objective < settings.converged_squares and (jacobians.fresh or predicted)
+        if converged or (steps == settings.patience_steps and base.objective >= give_up_above):
             break
         kept = jacobians if predicted else jacobians.linear()
-    return now
+    return base
 
 
 def _hopeless(begun: Chosen, near: Fit, give_up_above: float) -> float:
@@ -236,16 +236,16 @@ def _hopeless(begun: Chosen, near: Fit, give_up_above: float) -> float:
     return near.objective + (give_up_above - near.objective) * takes
 
 
-def _polished(problem: _Problem, now: _State) -> _State:
+def _polished(problem: _Problem, base: _State) -> _State:
     """State after ever smaller steps of jumping effects: derivatives lead only from afar."""
-    moving = [(effect.jumps, step_of(parameter)) for effect, _ in now.chosen for parameter in effect.parameters]
+    moving = [(effect.jumps, step_of(parameter)) for effect, _ in base.chosen for parameter in effect.parameters]
     for halved in range(problem.settings.polish_rounds):
         for j, (jumps, h) in enumerate(moving):
             for sign in (1.0, -1.0) if jumps else ():
-                x = free_of(now.chosen)
+                x = free_of(base.chosen)
                 x[j] += sign * h * 2.0 ** (1 - halved)
-                now = min(now, problem.state(_bound(now.chosen, x), now), key=_objective)
-    return now
+                base = min(base, problem.state(_bound(base.chosen, x), base), key=_objective)
+    return base
 
 
 def _bound(chosen: Chosen, x: Theta) -> Chosen:
@@ -259,16 +259,16 @@ def direction(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     return x / max(float(np.linalg.norm(x)), 1e-300)
 
 
-def _onsets(problem: _Problem, now: _State) -> Iterator[Chosen]:
+def _onsets(problem: _Problem, base: _State) -> Iterator[Chosen]:
     """Onset times that minimise the cost: no effect before it, the effect after."""
-    for k, (effect, _) in enumerate(() if problem.hold_onsets else now.chosen):
+    for k, (effect, _) in enumerate(() if problem.hold_onsets else base.chosen):
         for j, parameter in enumerate(effect.parameters):
             if not parameter.begins:
                 continue
             at, excess = [], []
-            each = zip(problem.logs, problem.masks, now.bias, now.passes, now.residuals, strict=True)
+            each = zip(problem.logs, problem.masks, base.bias, base.passes, base.residuals, strict=True)
             for log, mask, bias, forward, residual in each:
-                passes = (ForwardPass(log.pair, with_value(now.chosen, k, j, t), forward) for t in (np.inf, -np.inf))
+                passes = (ForwardPass(log.pair, with_value(base.chosen, k, j, t), forward) for t in (np.inf, -np.inf))
                 ends = (log.residual(end.blocks, (forward.blocks, residual)) - log.constants * bias for end in passes)
                 never, always = ((end[mask] ** 2).sum(1) for end in ends)
                 at.append(log.pair.stamp_s[:: log.whiten.every][mask])
@@ -276,7 +276,7 @@ def _onsets(problem: _Problem, now: _State) -> Iterator[Chosen]:
             order = np.argsort(np.concatenate(at), kind="stable")
             t_s, cost = np.concatenate(at)[order], np.cumsum(np.concatenate(excess)[order])
             best = int(np.argmin(cost[:-1]))
-            yield with_value(now.chosen, k, j, float(t_s[best] + t_s[best + 1]) / 2.0)
+            yield with_value(base.chosen, k, j, float(t_s[best] + t_s[best + 1]) / 2.0)
 
 
 def _normal(

@@ -138,9 +138,9 @@ class ForwardPass:
             state = before.through(effect, np.where(moves, bound(effect, x + h * only_j), theta))
             for other, values in behind:
                 state = state.through(other, values)
-            for (first, then), (_, now) in zip(self.pair.blocks(state.samples()), self.blocks, strict=True):
-                if then is not now:
-                    rows = np.subtract(then.T, now.T, order="C")
+            for (first, then), (_, block) in zip(self.pair.blocks(state.samples()), self.blocks, strict=True):
+                if then is not block:
+                    rows = np.subtract(then.T, block.T, order="C")
                     rows /= h
                     yield from ((first + k, j, row) for k, row in enumerate(rows) if row.any())
 
@@ -259,14 +259,14 @@ class Jacobians:
     def __init__(
         self, whiteners: Sequence[Whitener], passes: Sequence[ForwardPass], chosen: Chosen, known: Jacobians | None = None
     ) -> None:
-        theirs: dict[int, tuple[EffectJacobian, ...]] = {} if known is None else known._by_effect
-        self.fresh = not any(id(effect) in theirs for effect, _ in chosen)
+        known_jacobians: dict[int, tuple[EffectJacobian, ...]] = {} if known is None else known._by_effect
+        self.fresh = not any(id(effect) in known_jacobians for effect, _ in chosen)
         self.chosen = chosen
         self._by_effect: dict[int, tuple[EffectJacobian, ...]] = {}
         for effect, _ in chosen:
-            there = theirs.get(id(effect))
-            mine = (effect_jacobian(whiten, forward, effect) for whiten, forward in zip(whiteners, passes, strict=True))
-            self._by_effect[id(effect)] = tuple(mine) if there is None else there
+            known_jacobian = known_jacobians.get(id(effect))
+            own = (effect_jacobian(whiten, forward, effect) for whiten, forward in zip(whiteners, passes, strict=True))
+            self._by_effect[id(effect)] = tuple(own) if known_jacobian is None else known_jacobian
 
     def linear(self) -> Jacobians:
         """Those of the linear effects alone, which change least from step to step."""

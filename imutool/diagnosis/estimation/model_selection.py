@@ -71,13 +71,13 @@ def select_effects(
     second = replace(first, candidates=known.copy(), progress=lambda text: None)
     other = Forked(lambda: portable(*_grown(second, begun, *other_order))) if unnamed else None
     answers = [_grown(first, begun, *order)]
-    now = answers[0][1]
-    doubtful = len(now.chosen) - len(always) >= settings.suspicious_effects or unnamed_count(now) > 0
-    if other is not None and doubtful and now.objective > settings.explained_chi_square * now.numbers:
+    base = answers[0][1]
+    doubtful = len(base.chosen) - len(always) >= settings.suspicious_effects or unnamed_count(base) > 0
+    if other is not None and doubtful and base.objective > settings.explained_chi_square * base.numbers:
         # many small parts that do not add up, or an unnamed one: perhaps one effect alone is the better answer
         described = other.result()
         trial = restored(described, start, (*(effect for effect, _ in always), *candidates, *unnamed))
-        better = bic(trial) < bic(now) - settings.clearly_better
+        better = bic(trial) < bic(base) - settings.clearly_better
         answers.insert(0 if better else 1, (replace(second, unnamed=unnamed[: described.unnamed], progress=report), trial))
     elif other is not None:
         other.end()
@@ -85,22 +85,22 @@ def select_effects(
     alone = ((search, fit(logs, found.chosen[:count])) for search, found in answers if len(found.chosen) > count)
     selections = (search.tested(search.simplified(found)) for search, found in chain(answers, alone))
     best = next(selections)
-    best = best if best.selected else next((one for one in selections if one.selected), best)  # unseen time refuted the best
+    best = best if best.selected else next((each for each in selections if each.selected), best)  # unseen time refuted the best
     noise = smoothing(best.whole, len(always))
     return select_effects(logs, candidates, later, report, always=(*always, *noise)) if noise else best
 
 
-def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:
+def _grown(first: _Search, base: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:
     """Fit after effects came in one by one, until no candidate explains more than chance."""
     search, settings, waiting = replace(first, unnamed=tuple(unnamed)), first.settings, list(later)
     before, largest = first.before, np.zeros(first.logs[0].pair.columns)  # squares left, and by column the largest effect's
     for _ in range(settings.rounds):
-        count = len(now.chosen) - len(first.always)
-        search.progress(" with ".join([f"{len(search.named) + len(search.unnamed)} effects", *now.keys[len(first.always) :]]))
-        hopeless = count > settings.suspicious_effects and now.objective > settings.hopeless_chi_square * now.numbers
-        hopeless &= before - now.objective < settings.hopeless_share * (before - now.numbers)
-        better = search.added(now) if count < settings.most_effects and not hopeless else None
-        gained = axis_squares(now) - axis_squares(better or now)
+        count = len(base.chosen) - len(first.always)
+        search.progress(" with ".join([f"{len(search.named) + len(search.unnamed)} effects", *base.keys[len(first.always) :]]))
+        hopeless = count > settings.suspicious_effects and base.objective > settings.hopeless_chi_square * base.numbers
+        hopeless &= before - base.objective < settings.hopeless_share * (before - base.numbers)
+        better = search.added(base) if count < settings.max_effects and not hopeless else None
+        gained = axis_squares(base) - axis_squares(better or base)
         if better is not None and gained.max() >= settings.negligible_share * largest[gained.argmax()]:
             largest = np.maximum(largest, gained)
             better = with_finer_curve(search.logs, better)
@@ -110,12 +110,12 @@ def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[
             if better.chosen[-1][0].name in LAGS:
                 better = with_filter_of_each_sensor(search.logs, better, search.named)
             better = with_form_of_resonance(search.logs, better, search.named)
-            before, now = now.objective, search.pruned(search.exchanged(better))
+            before, base = base.objective, search.pruned(search.exchanged(better))
         elif waiting:
             search = replace(search, unnamed=(*search.unnamed, *waiting.pop(0)))
         else:
             break
-    return search, now
+    return search, base
 
 
 @dataclass(eq=False)
@@ -127,49 +127,50 @@ class _Search(Trial):
     @property
     def searched(self) -> tuple[Effect, ...]:
         """Named candidates, but for those that come in as the form of another."""
-        own = (one for one in self.named if not one.constants or one.variant == ZONE)
-        return tuple(one for one in own if (one.name != LOW_PASSES[1] or not one.variant))
+        own = (effect for effect in self.named if not effect.constants or effect.variant == ZONE)
+        return tuple(effect for effect in own if (effect.name != LOW_PASSES[1] or not effect.variant))
 
-    def removable(self, now: Fit) -> range:
+    def removable(self, base: Fit) -> range:
         """Indices of effects but for those of every fit and the last, which has just come in."""
-        return range(len(self.always), len(now.chosen) - 1)
+        return range(len(self.always), len(base.chosen) - 1)
 
-    def added(self, now: Fit, but_for: frozenset[str] = frozenset()) -> Fit | None:
+    def added(self, base: Fit, but_for: frozenset[str] = frozenset()) -> Fit | None:
         """The best fit with one more effect; none if chance explains its gain, or the error of a low-pass may do so."""
         settings, share, count = self.settings, self.settings.rival_share, self.settings.fitted_each_round
-        self.trials_of, self.trials = now, self.trials if self.trials_of is now else {}
-        allowed = self.searched + (self.unnamed if unnamed_count(now) < settings.most_unnamed else ())
-        allowed, error = tuple(effect for effect in allowed if effect.key not in but_for), LowPassError.of(now)
+        self.trials_of, self.trials = base, self.trials if self.trials_of is base else {}
+        allowed = self.searched + (self.unnamed if unnamed_count(base) < settings.max_unnamed else ())
+        allowed, error = tuple(effect for effect in allowed if effect.key not in but_for), LowPassError.of(base)
         best: tuple[float, Fit] | None = None
         unsure = set[str]()
-        for promised, effect, start, gain in self.candidates.ranked(now, allowed, count)[:count]:
+        for promised, effect, start, gain in self.candidates.ranked(base, allowed, count)[:count]:
             if best is not None and promised > best[0] * (1.0 if effect.linear else share):
                 continue  # the score of a linear effect is its gain
-            if effect.name == WANDER and gain < self.settings.unnamed_share * (now.objective - now.numbers):
+            if effect.name == WANDER and gain < self.settings.unnamed_share * (base.objective - base.numbers):
                 continue  # errors of poses last for seconds, as it does
             if effect.key not in self.trials:
-                limit = now.objective - (0.0 if best is None else share * (now.objective - best[1].objective))
-                self.trials[effect.key] = self.tried_with(now.chosen, effect, start, now, limit)
+                limit = base.objective - (0.0 if best is None else share * (base.objective - best[1].objective))
+                self.trials[effect.key] = self.tried_with(base.chosen, effect, start, base, limit)
             added_effect, theta = (trial := self.trials[effect.key]).chosen[-1]
             if not added_effect.parameters or beyond_the_band(added_effect, theta, self.logs, self.settings):
                 continue
             log_p = partial(self.candidates.log_p, added_effect)
-            own_log_p = log_p(now.objective - trial.objective)
+            own_log_p = log_p(base.objective - trial.objective)
             if (
                 error is not None
                 and own_log_p < self.threshold
-                and error.may_be(added_effect, now, trial, log_p, self.threshold)
+                and error.may_be(added_effect, base, trial, log_p, self.threshold)
             ):
                 unsure.add(effect.key)
                 continue
             best = (own_log_p, trial) if best is None or own_log_p < best[0] else best
         if best is None and unsure:
-            return self.added(now, but_for | unsure)
+            return self.added(base, but_for | unsure)
         if best is None or best[0] > self.threshold:
             return None
-        if unnamed_count(best[1]) and now.objective - best[1].objective < settings.unnamed_share * (self.before - now.numbers):
+        limit = settings.unnamed_share * (self.before - base.numbers)
+        if unnamed_count(best[1]) and base.objective - best[1].objective < limit:
             return None  # the rim of something that has no name: a name for it would be wrong
-        return self.candidates.jump_on_trend(now, best[1], self.named, self.threshold)
+        return self.candidates.jump_on_trend(base, best[1], self.named, self.threshold)
 
     def tried_with(self, others: Chosen, effect: Effect, start: Theta, near: Fit, limit: float) -> Fit:
         """Fit with one more effect, without its implausibly large parameters."""
@@ -180,49 +181,50 @@ class _Search(Trial):
         start = values_of(effect, reduced, theta)
         return trial if reduced is effect else fit(self.logs, (*others, (reduced, start)), near=near, give_up_above=limit)
 
-    def exchanged(self, now: Fit) -> Fit:
+    def exchanged(self, base: Fit) -> Fit:
         """Fit with an effect replaced by another of the catalogue that explains more."""
-        for k in self.removable(now) if len(now.chosen) - len(self.always) <= self.settings.exchanged_effects else ():
-            others, mine = (*now.chosen[:k], *now.chosen[k + 1 :]), now.chosen[k][0]
-            without = fit(self.logs, others, iterations=2, near=now)
-            own_log_p = self.candidates.log_p(mine, without.objective - now.objective)
-            unfitted = fit(self.logs, others, iterations=0, near=now)  # refitted, a nonlinear effect may diverge for good
+        for k in self.removable(base) if len(base.chosen) - len(self.always) <= self.settings.exchanged_effects else ():
+            others, own = (*base.chosen[:k], *base.chosen[k + 1 :]), base.chosen[k][0]
+            without = fit(self.logs, others, iterations=2, near=base)
+            own_log_p = self.candidates.log_p(own, without.objective - base.objective)
+            unfitted = fit(self.logs, others, iterations=0, near=base)  # refitted, a nonlinear effect may diverge for good
             for log_p, effect, start, _ in self.candidates.ranked(unfitted, self.searched, 2)[:2]:
-                if effect.key == mine.key and effect.linear:  # its score is its gain
+                if effect.key == own.key and effect.linear:  # its score is its gain
                     break
-                if effect.key == mine.key or (log_p > own_log_p and not mine.linear):
+                if effect.key == own.key or (log_p > own_log_p and not own.linear):
                     continue
-                limit = without.objective - self.settings.rival_share * (without.objective - now.objective)
+                limit = without.objective - self.settings.rival_share * (without.objective - base.objective)
                 trial = self.tried_with(others, effect, start, without, limit)
                 if self.candidates.log_p(trial.chosen[-1][0], without.objective - trial.objective) < own_log_p - 1.0:
                     return trial
-        return now
+        return base
 
-    def simplified(self, now: Fit) -> Fit:
+    def simplified(self, base: Fit) -> Fit:
         """Fit with the simpler of two effects that the logs hardly tell apart."""
-        for effect in [effect for effect, _ in now.chosen if effect.kind != "catalogue"]:
-            rivals = self.rivals(now.keys.index(effect.key), now).values()  # a name that leaves no more says more
-            left = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
-            now = next((trial for trial in rivals if left(trial) < left(now)), now)
-        now = with_delay_of_accel(self.logs, with_form_of_low_pass(self.logs, now, self.named), self.named)
-        now = with_filter_of_each_sensor(self.logs, now, self.named)
-        now = with_plainer_effects(self.logs, with_steady_clock(self.logs, now, self.named, self.candidates.starts), self.named)
-        now = without_unseen_low_pass(self.logs, now, self.named, self.settings)
-        log_p, most = self.candidates.log_p, self.threshold
-        return with_common_arm(self.logs, now, self.named, self.settings, lambda effect, gain: log_p(effect, gain) < most)
+        for effect in [effect for effect, _ in base.chosen if effect.kind != "catalogue"]:
+            rivals = self.rivals(base.keys.index(effect.key), base).values()  # a name that leaves no more says more
+            score = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
+            base = next((trial for trial in rivals if score(trial) < score(base)), base)
+        base = with_delay_of_accel(self.logs, with_form_of_low_pass(self.logs, base, self.named), self.named)
+        base = with_filter_of_each_sensor(self.logs, base, self.named)
+        base = with_steady_clock(self.logs, base, self.named, self.candidates.starts)
+        base = with_plainer_effects(self.logs, base, self.named)
+        base = without_unseen_low_pass(self.logs, base, self.named, self.settings)
+        log_p, maximum = self.candidates.log_p, self.threshold
+        return with_common_arm(self.logs, base, self.named, self.settings, lambda effect, gain: log_p(effect, gain) < maximum)
 
-    def pruned(self, now: Fit) -> Fit:
+    def pruned(self, base: Fit) -> Fit:
         """The fit without effects that the others have made superfluous."""
         fits = dict[int, Fit]()
 
         def without(k: int) -> Fit:
-            effect, theta = now.chosen[k]
-            least = gain_for(self.threshold - self.candidates.log_choices[effect.key], len(theta))
-            limit = now.objective + self.settings.give_up_factor * least  # a superfluous effect leaves less after a few steps
-            return fits.setdefault(k, fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]), near=now, give_up_above=limit))
+            effect, theta = base.chosen[k]
+            gain = gain_for(self.threshold - self.candidates.log_choices[effect.key], len(theta))
+            limit = base.objective + self.settings.give_up_factor * gain  # a superfluous effect leaves less after a few steps
+            return fits.setdefault(k, fit(self.logs, (*base.chosen[:k], *base.chosen[k + 1 :]), near=base, give_up_above=limit))
 
-        removable = self.removable(now)
+        removable = self.removable(base)
         for k, objective in zip(removable, of_each(lambda k: without(k).objective, removable), strict=True):
-            if self.candidates.log_p(now.chosen[k][0], objective - now.objective) > self.threshold:
+            if self.candidates.log_p(base.chosen[k][0], objective - base.objective) > self.threshold:
                 return self.pruned(fits[k] if k in fits else without(k))
-        return now
+        return base

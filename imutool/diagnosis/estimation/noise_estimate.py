@@ -30,14 +30,14 @@ from imutool.sensor.effects import vibration
 logger = logging.getLogger(__name__)
 
 RIDGE = 1e-8
-LEAST_ROWS = 2  # times the order of the noise model: rows that follow others without a gap
+MIN_ROWS = 2  # times the order of the noise model: rows that follow others without a gap
 ALL_SLOW, SLOW_ORDER = 0.9, 4  # of the frequencies, from which on nothing is fast; order of the filter
 Axes = Float64[np.ndarray, " _"]
 EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the bands in which the poses are checked
 
 
 def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -> WhitenedImu:
-    """Whitened log with its noise model; beside poses also with the band that they know."""
+    """Whitened log with its noise model; against poses also with the band that they know."""
     if pair.exact:
         residual, rate_hz = _left(pair, candidates), 1.0 / pair.period_s
         return _counting(pair, level(residual, pair.usable, rate_hz, pair.settings.noise, pair.noise_left, pair.sim_lsb))
@@ -81,12 +81,12 @@ def _check_rows(pair: Pair, band: Band) -> None:
     order = pair.settings.noise.order
     usable = pair.usable[:: band.every]
     counts = [int(settled(rows, order).sum()) for rows in usable.T if rows.any()]
-    if not counts or min(counts) < LEAST_ROWS * order:
-        step_s, left, least = pair.period_s * band.every, min(counts, default=0), LEAST_ROWS * order
+    if not counts or min(counts) < MIN_ROWS * order:
+        step_s, rows, minimum = pair.period_s * band.every, min(counts, default=0), MIN_ROWS * order
         raise DataError(
-            f"its poses show motion below {pair.band_hz:.3g} Hz; {left} values every {step_s:.2g} s are there without a gap",
+            f"its poses show motion below {pair.band_hz:.3g} Hz; {rows} values every {step_s:.2g} s have no gap",
             where=pair.name,
-            expected=f"{least} or more",
+            expected=f"{minimum} or more",
             fix="Record longer, with fewer gaps, or with poses at a higher rate",
         )
 
@@ -117,8 +117,8 @@ def _in_band(
     return Whitener(whiten.filters, whiten.std, band)
 
 
-def limited_to_quiet_axes(whiten: Whitener, most: float) -> Whitener:
-    """Whitener with no axis more than `most` times as noisy as the middle axis of its sensor.
+def limited_to_quiet_axes(whiten: Whitener, maximum: float) -> Whitener:
+    """Whitener with no axis more than `maximum` times as noisy as the middle axis of its sensor.
 
     Poses err alike in all directions, and a sensor's axes are equally noisy; an axis with a much larger residual holds what
     the catalogue has no name for.
@@ -128,8 +128,8 @@ def limited_to_quiet_axes(whiten: Whitener, most: float) -> Whitener:
     for part in (slice(0, 3), slice(3, 6)):
         middle = int(np.argsort(total[part])[1]) + part.start
         for axis in range(part.start, part.stop):
-            if total[axis] > most * total[middle]:
-                filters[axis], std[axis] = whiten.filters[middle], most * whiten.std[middle]
+            if total[axis] > maximum * total[middle]:
+                filters[axis], std[axis] = whiten.filters[middle], maximum * whiten.std[middle]
     return Whitener(filters, std, whiten.band)
 
 
@@ -154,7 +154,7 @@ def _left(pair: Pair, candidates: Sequence[Effect]) -> Float64[np.ndarray, "n 6"
 
 
 def is_coloured_noise(effect: Effect, theta: Theta, found: Fit) -> bool:
-    """Whether a line beside a simulation is noise that an autoregression smooths, or wanders."""
+    """Whether a line against a simulation is noise that an autoregression smooths, or wanders."""
     exact, chance = [log.pair for log in found.logs if log.pair.exact], found.logs[0].pair.settings.search.false_discovery_rate
     if effect.name != vibration.EFFECT.name or len(exact) < len(found.logs):
         return False
@@ -247,10 +247,10 @@ def known_band_hz(
     real: Float64[np.ndarray, "n k"],
     expectation: Float64[np.ndarray, "n k"],
     rate_hz: float,
-    most_hz: float,
+    max_hz: float,
     settings: BandSettings,
 ) -> float:
-    """Band edge (Hz, up to `most_hz`) below which poses have hardly any error.
+    """Band edge (Hz, up to `max_hz`) below which poses have hardly any error.
 
     An error of the expectation does two things together: the recording shares less of it (coherence), and follows it with a
     gain that is too small by as much (regression dilution; Fuller, Measurement Error Models, 1987, eq. 1.1.7: gain = true gain
@@ -278,10 +278,10 @@ def known_band_hz(
         lost = 1.0 - gain * (1.0 + settings.sigma * std)
         return np.asarray(np.minimum(lost, 1.0 - coherence) > settings.diluted_share)
 
-    known = ~is_diluted(*follows(EDGES_HZ[0], settings.least_hz))  # no band helps an axis whose slow motion is not known
-    for low, high in pairwise([*(hz for hz in EDGES_HZ if hz + 1.0 / settings.segment_s <= most_hz), most_hz]):
-        if low >= settings.least_hz:
+    known = ~is_diluted(*follows(EDGES_HZ[0], settings.min_hz))  # no band helps an axis whose slow motion is not known
+    for low, high in pairwise([*(hz for hz in EDGES_HZ if hz + 1.0 / settings.segment_s <= max_hz), max_hz]):
+        if low >= settings.min_hz:
             (slow, slow_std, _), (fast, fast_std, coherence) = follows(EDGES_HZ[0], low), follows(low, high)
             if (known & is_diluted(fast / slow, np.hypot(slow_std, fast_std), coherence)).any():
                 return low  # a lively axis must not hide a quiet one
-    return most_hz
+    return max_hz

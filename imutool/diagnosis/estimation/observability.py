@@ -25,7 +25,7 @@ from imutool.sensor.effects.gyro_scale import STEP
 
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
 SHARED, STANDS_STILL = "share", 0.4  # variant of a hysteresis; of the motion, what such a share moves at least
-MOST_SHARE = 1.2  # of the reading that lags: all of it, and what a fit errs by
+MAX_SHARE = 1.2  # of the reading that lags: all of it, and what a fit errs by
 LOW_PASSES = ("low_pass", "second_order_low_pass")
 NEEDS_DELAY = {"clock_offset": ("clock_skew", "clock_jump", "clock_wander", *LOW_PASSES, "mount_resonance")}
 """What delays, rings, jumps or wanders needs the motion that shows a delay."""
@@ -50,7 +50,7 @@ Starts = Mapping[str, Sequence[Theta]]
 def unobservable(logs: Sequence[WhitenedLog], candidates: Sequence[Effect], settings: SearchSettings) -> tuple[str, ...]:
     """Unobservable parameters `effect.parameter`, or `effect` where all of them are.
 
-    At its plausible size such a parameter adds fewer than `observable_squares` to the white residuals, beside a constant bias.
+    At its plausible size such a parameter adds fewer than `observable_squares` to the white residuals, given a constant bias.
     """
     out: list[str] = []
     names = {effect.name for effect in candidates}
@@ -103,8 +103,8 @@ def with_free(effect: Effect, free: Sequence[int], sensors: tuple[str, ...] = ()
     """Effect with only some free parameters, by index, on some sensors; itself with all."""
     if len(free) == len(effect.parameters):
         return effect
-    left = tuple(effect.parameters[k] for k in free)
-    return replace(effect, sensors=sensors or effect.sensors, parameters=left, forward=FixedParameters(effect, free))
+    kept_parameters = tuple(effect.parameters[k] for k in free)
+    return replace(effect, sensors=sensors or effect.sensors, parameters=kept_parameters, forward=FixedParameters(effect, free))
 
 
 def without_implausible(effect: Effect, theta: Theta, factor: float) -> Effect:
@@ -114,40 +114,40 @@ def without_implausible(effect: Effect, theta: Theta, factor: float) -> Effect:
     return with_free(effect, [k for k, n in enumerate(effect.parameters) if abs(theta[k]) <= factor * n.plausible])
 
 
-def with_steady_clock(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect], starts: Starts) -> Fit:
+def with_steady_clock(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect], starts: Starts) -> Fit:
     """Fit with one or two of offset, skew and jump for a clock that wanders, if as good (BIC)."""
-    others, best = tuple(entry for entry in now.chosen if entry[0].name != WANDER), now
-    if len(others) == len(now.chosen):
-        return now
-    steady = [effect for effect in named if effect.name in STEADY and effect.key not in now.keys]
+    others, best = tuple(entry for entry in base.chosen if entry[0].name != WANDER), base
+    if len(others) == len(base.chosen):
+        return base
+    steady = [effect for effect in named if effect.name in STEADY and effect.key not in base.keys]
     for some in chain(combinations(steady, 1), combinations(steady, 2)):
         on_trend = len(some) > 1 and any(effect.name == "clock_skew" for effect in some)
         at = {"clock_offset": 0, "clock_skew": 0, "clock_jump": -1 if on_trend else 0}
         begun = (*others, *((effect, starts[effect.key][at[effect.name]]) for effect in some))
-        best = min(best, fit(logs, begun, near=now, give_up_above=bic(best) - parameter_cost(now, begun)), key=bic)
+        best = min(best, fit(logs, begun, near=base, give_up_above=bic(best) - parameter_cost(base, begun)), key=bic)
     return best
 
 
-def with_plainer_effects(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect]) -> Fit:
+def with_plainer_effects(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with the plainer of two effects where the other is not clearly better (BIC)."""
     poses = any(log.pair.band_hz is not None for log in logs)
-    for complex_one, theta in now.chosen:
+    for complex_one, theta in base.chosen:
         sizes = _plainer(complex_one, theta, poses=poses)
-        rest = tuple(entry for entry in now.chosen if entry[0] is not complex_one)
-        plainer = [effect for effect in named if effect.name in sizes and effect.key not in now.keys]
+        rest = tuple(entry for entry in base.chosen if entry[0] is not complex_one)
+        plainer = [effect for effect in named if effect.name in sizes and effect.key not in base.keys]
         parts = [(with_free(e, sizes[e.name][0], complex_one.sensors), np.array(sizes[e.name][1])) for e in plainer]
-        margin = now.logs[0].pair.settings.search.clearly_better * max(1.0, now.reduced_chi_square)
-        limits = [bic(now) + margin - parameter_cost(now, (*rest, part)) for part in parts]
-        trials = [fit(logs, (*rest, part), near=now, give_up_above=at) for part, at in zip(parts, limits, strict=True)]
-        best = min(trials, key=bic, default=now)
-        now = best if bic(best) < bic(now) + margin else now
-    return now
+        margin = base.logs[0].pair.settings.search.clearly_better * max(1.0, base.reduced_chi_square)
+        limits = [bic(base) + margin - parameter_cost(base, (*rest, part)) for part in parts]
+        trials = [fit(logs, (*rest, part), near=base, give_up_above=at) for part, at in zip(parts, limits, strict=True)]
+        best = min(trials, key=bic, default=base)
+        base = best if bic(best) < bic(base) + margin else base
+    return base
 
 
 def _plainer(effect: Effect, theta: Theta, *, poses: bool) -> Mapping[str, tuple[Sequence[int], Sequence[float]]]:
     """Effects that may stand for one: their free parameters, by index, and a start.
 
-    A clock that jumps, a gyro that lags beside poses (which have a clock of their own), a drift or step of a bias beside a
+    A clock that jumps, a gyro that lags against poses (which have a clock of their own), a drift or step of a bias beside a
     temperature of the log, two gains of axes that hardly change their sign, a share that lags by as much as the motion, three
     scales as one gravity within what Earth has.
     """
@@ -170,27 +170,27 @@ def _plainer(effect: Effect, theta: Theta, *, poses: bool) -> Mapping[str, tuple
 
 def with_common_arm(
     logs: Sequence[WhitenedLog],
-    now: Fit,
+    base: Fit,
     named: Sequence[Effect],
     settings: SearchSettings,
     is_significant: Callable[[Effect, float], bool],
 ) -> Fit:
     """Fit with a lever arm for a size effect of equal arms; with both if the rest is smaller."""
-    arms = [k for k, (effect, _) in enumerate(now.chosen) if effect.name == "size_effect" and len(effect.parameters) == 9]
-    lever = [effect for effect in named if effect.name == "lever_arm" and effect.key not in now.keys]
+    arms = [k for k, (effect, _) in enumerate(base.chosen) if effect.name == "size_effect" and len(effect.parameters) == 9]
+    lever = [effect for effect in named if effect.name == "lever_arm" and effect.key not in base.keys]
     if not arms or not lever:
-        return now
-    others, (size_effect, theta) = (*now.chosen[: arms[0]], *now.chosen[arms[0] + 1 :]), now.chosen[arms[0]]
-    without = fit(logs, others, near=now)
-    simple = fit(logs, (*others, (lever[0], lever[0].null_value.astype(float))), near=now)
-    if without.objective - simple.objective < settings.common_arm_share * (without.objective - now.objective):
-        return now
+        return base
+    others, (size_effect, theta) = (*base.chosen[: arms[0]], *base.chosen[arms[0] + 1 :]), base.chosen[arms[0]]
+    without = fit(logs, others, near=base)
+    simple = fit(logs, (*others, (lever[0], lever[0].null_value.astype(float))), near=base)
+    if without.objective - simple.objective < settings.common_arm_share * (without.objective - base.objective):
+        return base
     rest = with_free(size_effect, range(6))  # of the x and y axes against z, whose arm is the lever arm
     both = fit(logs, (*simple.chosen, (rest, rest.null_value.astype(float))), near=simple)
     if not is_significant(rest, simple.objective - both.objective):
         return simple
     positions = theta.reshape(3, 3)  # of each axis
-    return both if np.linalg.norm(positions.mean(axis=0)) > np.linalg.norm(positions.std(axis=0)) else now
+    return both if np.linalg.norm(positions.mean(axis=0)) > np.linalg.norm(positions.std(axis=0)) else base
 
 
 def values_of(effect: Effect, reduced: Effect, theta: Theta) -> Theta:
@@ -240,7 +240,7 @@ def may_act(effect: Effect, keys: Sequence[str]) -> bool:
 
 def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], settings: SearchSettings) -> bool:
     """Whether a fit is no answer: beyond the poses' band, too slow, too loud, or noise."""
-    if any(n.least is not None and value < n.least for n, value in zip(effect.parameters, theta, strict=True)):
+    if any(n.minimum is not None and value < n.minimum for n, value in zip(effect.parameters, theta, strict=True)):
         return True
     by_poses = [log.pair for log in logs if log.pair.band_hz is not None]
     if effect.name == vibration.EFFECT.name and any(_is_motion(effect, theta, pair) for pair in by_poses):
@@ -254,19 +254,19 @@ def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], s
         takes_back = bool(theta[2:5].sum() < 0.0)  # as no spring does
         overdamped = bool(theta[1] > 1.0)  # a lag, which does not ring
         return outside or takes_back or overdamped or any(_rings_too_loud(effect, theta, log.pair) for log in logs)
-    if effect.variant == SHARED and (theta[1] > MOST_SHARE or all(_is_scale(effect, theta, log.pair) for log in logs)):
+    if effect.variant == SHARED and (theta[1] > MAX_SHARE or all(_is_scale(effect, theta, log.pair) for log in logs)):
         return True
     noise = [log.pair.sim_noise[log.pair.signals[effect.sensors[0]]].max() for log in logs if isinstance(log.pair, Pair)]
-    least = settings.beyond_sim_noise * max(noise, default=0.0)  # a narrower width takes what a filter left of it
-    return outside or any(n.name == "width" and value < least for n, value in zip(effect.parameters, theta, strict=True))
+    minimum = settings.beyond_sim_noise * max(noise, default=0.0)  # a narrower width takes what a filter left of it
+    return outside or any(n.name == "width" and value < minimum for n, value in zip(effect.parameters, theta, strict=True))
 
 
 def _is_scale(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:
     """Whether the share of a hysteresis stands still, because its width exceeds the motion: it lowers the scale alone."""
     (sensor,) = effect.sensors
     motion = expected(pair, ())[:, pair.signals[sensor]]
-    held = play(motion, float(theta[0]))
-    return bool((held.std(axis=0) < STANDS_STILL * motion.std(axis=0)).all())
+    output = play(motion, float(theta[0]))
+    return bool((output.std(axis=0) < STANDS_STILL * motion.std(axis=0)).all())
 
 
 def _is_motion(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:

@@ -54,19 +54,19 @@ def bic(found: Fit) -> float:
     return found.objective + parameter_cost(found, found.chosen)
 
 
-def leaves_as_little(found: Fit, key: str, least: float) -> bool:
-    """Whether a fit with an effect is as good as one whose Akaike criterion is `least`.
+def leaves_as_little(found: Fit, key: str, minimum: float) -> bool:
+    """Whether a fit with an effect is as good as one whose Akaike criterion is `minimum`.
 
     A parameter costs two squares. Where the log shows few of many (one of the nine of a g-sensitivity), the others cost no more
     than they explain, and the effect may be worse by the cost of one.
     """
     (theta,) = (theta for effect, theta in found.chosen if effect.key == key)
-    if found.objective + 2.0 * len(theta) < least + found.logs[0].pair.settings.search.clearly_better:
+    if found.objective + 2.0 * len(theta) < minimum + found.logs[0].pair.settings.search.clearly_better:
         return True
-    if found.objective > least:
+    if found.objective > minimum:
         return False
     cost = np.minimum(2.0, (theta / found.stds()[key]) ** 2).sum()
-    return bool(found.objective + cost < least + 2.0)
+    return bool(found.objective + cost < minimum + 2.0)
 
 
 def parameter_cost(like: Fit, chosen: Chosen) -> float:
@@ -104,8 +104,8 @@ def _gain_without(whole: Fit, left_out: Sequence[int], iterations: int | None) -
         return gain, gain
     walks = squares_of_walk(whole, whole, of_any_speed=True) > search.clearly_better
     of_any_speed = whole.chosen[left_out[0]][0].of_time or walks
-    explained, left = (squares_of_walk(one, whole, of_any_speed=of_any_speed) for one in (without, whole))
-    return gain, gain - max(0.0, explained - left)
+    explained, remaining = (squares_of_walk(fitted, whole, of_any_speed=of_any_speed) for fitted in (without, whole))
+    return gain, gain - max(0.0, explained - remaining)
 
 
 # ── robust covariance ──
@@ -144,7 +144,7 @@ def scatter(logs: Sequence[WhitenedLog], found: Fit, part: str, block_s: float) 
         share = _seen_from(lower, H)
         leverage, axes = np.linalg.eigh(share)
         turned = axes.T @ solve_triangular(lower, score, lower=True)
-        even = axes @ (turned / np.sqrt(1.0 - np.clip(leverage, 0.0, settings.most_leverage)))
+        even = axes @ (turned / np.sqrt(1.0 - np.clip(leverage, 0.0, settings.max_leverage)))
         middle += np.outer(even, even)
         shares.append(share)
     outer = solve_triangular(lower, np.eye(len(lower)), lower=True)  # covariance by information: outer.T @ outer
@@ -158,7 +158,7 @@ def scatter(logs: Sequence[WhitenedLog], found: Fit, part: str, block_s: float) 
 def _dilution(
     logs: Sequence[WhitenedLog], found: Fit, part: str, by_information: Matrix
 ) -> dict[str, Float64[np.ndarray, " _"]]:
-    """Regression dilution of scale factors beside poses, by effect: at most the squares left over the information.
+    """Regression dilution of scale factors against poses, by effect: at most the squares left over the information.
 
     The error e of the expectation f + e is in the residual as well: E[(f + e) (-e)] = -E[e²], alike in every block of time
     (Fuller, Measurement Error Models, 1987, eq. 1.1.7).
@@ -231,7 +231,7 @@ def _blocks(log: WhitenedLog, found: Fit, k: int, part: str, block_s: float) -> 
         J[axis, where] = J_axis - np.outer(J_axis @ constant, constant) / max(float(constant @ constant), 1e-300)
     J[:, begins] = 0.0
     t_s = log.pair.stamp_s[:: log.whiten.every][rows]
-    block = np.floor((t_s - t_s[0]) / min(block_s, np.ptp(t_s) / log.pair.settings.significance.least_blocks)).astype(int)
+    block = np.floor((t_s - t_s[0]) / min(block_s, np.ptp(t_s) / log.pair.settings.significance.min_blocks)).astype(int)
     out = []
     for number in np.unique(block):
         inside = block == number

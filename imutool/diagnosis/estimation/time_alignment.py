@@ -32,7 +32,7 @@ from imutool.sensor.samples import IdealMotion
 
 REFINEMENTS = 3  # of a lag
 KNOWN_SHARE = 0.5  # of the samples that have a true pose, from which on the poses are worth drawing
-LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
+MIN_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
 Simulated = tuple[IdealMotion, Float64[np.ndarray, "6"], NoiseLeft | None]
 
 
@@ -60,11 +60,11 @@ def with_simulation(
         simulated = _simulated(t_sim, part, shift_s, start_ns, real, settings, own_poses)
         found.append((simulated, (stamp_s >= simulated[0].t_s[0]) & (stamp_s <= simulated[0].t_s[-1])))
     shared_s = [_shared_s(stamp_s, inside) for _, inside in found]
-    least_s = min(settings.alignment.least_s, max(shared_s))
+    min_s = min(settings.alignment.min_s, max(shared_s))
     return [
-        replace(_pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise, None, settings), noise_left=left)
-        for ((ideal, noise, left), inside), shared in zip(found, shared_s, strict=True)
-        if shared >= least_s
+        replace(_pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise, None, settings), noise_left=remaining)
+        for ((ideal, noise, remaining), inside), shared in zip(found, shared_s, strict=True)
+        if shared >= min_s
     ]
 
 
@@ -74,7 +74,7 @@ def _stretches(sim: Recording, settings: DiagnoseSettings) -> list[Recording]:
     hole_s = max(settings.alignment.hole_s, settings.split.gap_periods * sim.imu.period_s)
     holes = np.flatnonzero(np.diff(t_ns) > 1e9 * hole_s)
     parts = [sim.between(int(t_ns[a]), int(t_ns[b])) for a, b in zip([0, *(holes + 1)], [*holes, len(t_ns) - 1], strict=True)]
-    long = [part for part in parts if part.imu.duration_s >= settings.alignment.least_s]
+    long = [part for part in parts if part.imu.duration_s >= settings.alignment.min_s]
     return (long or [max(parts, key=lambda part: part.imu.duration_s)]) if len(holes) else [sim]
 
 
@@ -111,12 +111,12 @@ def _pair(
     settings: DiagnoseSettings,
 ) -> Pair:
     rows, shared_s = np.flatnonzero(inside), _shared_s(stamp_s, inside)
-    least_s = settings.alignment.least_s
-    if shared_s < least_s:
+    min_s = settings.alignment.min_s
+    if shared_s < min_s:
         raise DataError(
             f"{shared_s:.1f} s shared with the {against}",
             where=real.name,
-            expected=f"at least {least_s:g} s",
+            expected=f"at least {min_s:g} s",
             fix="Give logs of the same time, or a longer one",
         )
     part = slice(int(rows[0]), int(rows[-1]) + 1)
@@ -154,7 +154,7 @@ def _shared_s(stamp_s: Float64[np.ndarray, " n"], inside: Bool[np.ndarray, " n"]
 
 def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.ndarray, " n"]]:
     """Scalar channels of a log at some times; a single message is no course."""
-    return channels_at(recording, seconds(t_ns, int(t_ns[0])), int(t_ns[0]), least_messages=2)
+    return channels_at(recording, seconds(t_ns, int(t_ns[0])), int(t_ns[0]), min_messages=2)
 
 
 def _simulated(
@@ -178,14 +178,14 @@ def _simulated(
         t_s = seconds(unrounded(sim.truth.t_ns)[:1], start_ns + nanoseconds(shift_s))[0] + ideal.t_s
         ideal = replace(ideal, t_s=t_s, channels=_channels(real, start_ns + np.round(t_s * 1e9).astype(np.int64)))
         witnesses = recorded_at(sim.imu, t_s, start_ns + nanoseconds(shift_s)), recorded_at(real.imu, t_s, start_ns, ideal.gyro)
-        ideal, left = _shared_motion(ideal, 0.5 / period_s, np.concatenate(witnesses, axis=1), settings.alignment)
-        return ideal, np.zeros(6), None if own_poses else left
+        ideal, density = _shared_motion(ideal, 0.5 / period_s, np.concatenate(witnesses, axis=1), settings.alignment)
+        return ideal, np.zeros(6), None if own_poses else density
     t_s = np.linspace(t_sim[0], t_sim[-1], round((t_sim[-1] - t_sim[0]) / period_s) + 1)  # on the samples, if they are even
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
     recorded = None if own_poses else recorded_at(real.imu, t_s, start_ns, even[:, :3])  # shares no errors of poses either
-    clean, left = denoised(even, 1.0 / period_s, settings.alignment, recorded)
+    clean, density = denoised(even, 1.0 / period_s, settings.alignment, recorded)
     clean = even if copied else clean  # what the filter takes would separate a recording from itself
-    noise = np.minimum(noise, left.most)  # a vibration looks like white noise, and a recording shares it
+    noise = np.minimum(noise, density.maximum)  # a vibration looks like white noise, and a recording shares it
     clean = refined(clean, *of_real)
     t_s = np.linspace(t_s[0], t_s[-1], len(clean))
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
@@ -193,7 +193,8 @@ def _simulated(
     known = (_attitude(sim, t_ns + round(shift_s * 1e9)), _attitude(real, t_ns))
     R_wb = next((R for R in known if R is not None), None)
     R_wb = attitude_by_gyro(t_s, clean[:, :3], clean[:, 3:]) if R_wb is None else R_wb
-    return IdealMotion(t_s, clean[:, :3], clean[:, 3:], alpha, R_wb, _channels(real, t_ns)), noise, None if own_poses else left
+    motion = IdealMotion(t_s, clean[:, :3], clean[:, 3:], alpha, R_wb, _channels(real, t_ns))
+    return motion, noise, None if own_poses else density
 
 
 def _by_poses(
@@ -217,14 +218,14 @@ def _by_poses(
     if holes or poses.period_s * own.poses_hz > 1.0 or rows.mean() < own.poses_share:
         return None
     trajectory = fit_trajectory(poses)  # a simulation's poses are exact, or the test below fails
-    there = trajectory.at(t_ns[rows])
-    residual = samples[rows] - np.concatenate([there.omega_b, there.specific_force()], axis=1)
-    R_wb = quaternion.matrix(there.q_wb_wxyz)
+    at_samples = trajectory.at(t_ns[rows])
+    residual = samples[rows] - np.concatenate([at_samples.omega_b, at_samples.specific_force()], axis=1)
+    R_wb = quaternion.matrix(at_samples.q_wb_wxyz)
     off = gravity_error(R_wb, residual[:, 3:], settings.search.observable_squares)
     residual[:, 3:] -= np.einsum("nji,j->ni", R_wb, off)
-    if not is_white(residual - residual.mean(axis=0), noise, LEAST_NOISE, own.coarse_bands, own.coarse_factor, own.line_chance):
+    if not is_white(residual - residual.mean(axis=0), noise, MIN_NOISE, own.coarse_bands, own.coarse_factor, own.line_chance):
         return None
-    rate_hz *= refinement(np.concatenate([there.omega_b, there.specific_force()], axis=1), *of_real)
+    rate_hz *= refinement(np.concatenate([at_samples.omega_b, at_samples.specific_force()], axis=1), *of_real)
     t_ns = poses.t_ns[0] + np.arange(int(poses.duration_s * rate_hz) + 1) * round(1e9 / rate_hz)
     motion = trajectory.at(t_ns[t_ns <= poses.t_ns[-1]])
     t_s = np.arange(len(motion.p_wb)) * round(1e9 / rate_hz) * 1e-9
@@ -233,13 +234,13 @@ def _by_poses(
 
 
 def _shared_motion(
-    ideal: IdealMotion, most_hz: float, witnesses: Float64[np.ndarray, "n r"], settings: AlignmentSettings
+    ideal: IdealMotion, max_hz: float, witnesses: Float64[np.ndarray, "n r"], settings: AlignmentSettings
 ) -> tuple[IdealMotion, NoiseLeft]:
-    """Motion of poses at the frequencies, up to `most_hz`, that an IMU shares, and the noise that is left in it."""
+    """Motion of poses at the frequencies, up to `max_hz`, that an IMU shares, and the noise that is left in it."""
     noisy = np.concatenate([ideal.gyro, ideal.accel], axis=1)
-    clean, left = denoised(noisy, ideal.rate_hz, settings, witnesses, of_poses_to_hz=most_hz)
+    clean, noise_left = denoised(noisy, ideal.rate_hz, settings, witnesses, of_poses_to_hz=max_hz)
     alpha = ideal.alpha - np.asarray(make_interp_spline(ideal.t_s, noisy[:, :3] - clean[:, :3], k=5)(ideal.t_s, 1))
-    return replace(ideal, gyro=clean[:, :3], accel=clean[:, 3:], alpha=alpha), left
+    return replace(ideal, gyro=clean[:, :3], accel=clean[:, 3:], alpha=alpha), noise_left
 
 
 def _attitude(recording: Recording, t_ns: np.ndarray) -> Float64[np.ndarray, "n 3 3"] | None:
@@ -252,18 +253,18 @@ def _attitude(recording: Recording, t_ns: np.ndarray) -> Float64[np.ndarray, "n 
 def _shift(real: Imu, sim: Imu, settings: AlignmentSettings) -> float | None:
     """Clock shift (s) to add to the recording's times; 0 where a clock offset explains it, None for two motions."""
     overlap = (min(real.t_ns[-1], sim.t_ns[-1]) - max(real.t_ns[0], sim.t_ns[0])) * 1e-9
-    shared = overlap > min(settings.least_s, 0.5 * min(real.duration_s, sim.duration_s))
+    shared = overlap > min(settings.min_s, 0.5 * min(real.duration_s, sim.duration_s))
     if _rests(sim) and (_rests(real) or may_rest(real)):
         return 0.0 if shared else (int(sim.t_ns[0]) - int(real.t_ns[0])) * 1e-9
     dead, hz = not np.ptp(real.gyro, axis=0).any(), settings.align_hz  # then the accelerometer shows the motion
     turns = [_turning(imu.t_ns, imu.accel if dead else imu.gyro, hz) for imu in (real, sim)]
-    found = cross_correlation(turns[0], turns[1], round(min(settings.least_s * hz, 0.8 * min(map(len, turns)))))
+    found = cross_correlation(turns[0], turns[1], round(min(settings.min_s * hz, 0.8 * min(map(len, turns)))))
     lag_s = (int(sim.t_ns[0]) - int(real.t_ns[0])) * 1e-9 + found.lag / hz
-    within = (found.best(np.abs(lag_s) < most_s) for most_s in (settings.farthest_s, settings.offset_s, np.inf))
+    within = (found.best(np.abs(lag_s) < max_s) for max_s in (settings.farthest_s, settings.offset_s, np.inf))
     (_, _, near), (_, _, at_0), (lag, alike, sigma) = within
     if shared and near > settings.alike_sigma[0] and sigma < at_0 + settings.alike_sigma[1]:
         return 0.0
-    if sigma < settings.alike_sigma[1] or alike < settings.least_correlation:
+    if sigma < settings.alike_sigma[1] or alike < settings.min_correlation:
         return None
     at_s = float(lag_s[found.lag == lag][0])
     return at_s if dead else _refined(real, sim, at_s, settings)
@@ -271,7 +272,7 @@ def _shift(real: Imu, sim: Imu, settings: AlignmentSettings) -> float | None:
 
 def _rests(imu: Imu) -> bool:
     """Whether a gyro shows noise only, so that nothing can be aligned, and nothing has to be."""
-    return all(nothing_but_noise(column, least) for column, least in zip(imu.gyro.T, LEAST_NOISE, strict=False))
+    return all(nothing_but_noise(column, minimum) for column, minimum in zip(imu.gyro.T, MIN_NOISE, strict=False))
 
 
 def _refined(real: Imu, sim: Imu, lag_s: float, settings: AlignmentSettings) -> float:

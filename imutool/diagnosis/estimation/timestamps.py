@@ -19,7 +19,7 @@ from imutool.sensor.samples import SensorSamples
 from imutool.units import ASCII_UNITS, SENSORS, UNITS, Sensor
 
 SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft limit is looked for
-LEAST_VALUES, LEAST_ROWS = 3, 100  # of a grid
+MIN_VALUES, MIN_ROWS = 3, 100  # of a grid
 READ, NOISY = 0.999, 6.0  # of the readings are no glitch; deviations of a sample by which noise goes beyond a limit
 FINER = 0.05  # of the noise, that readings differ by right below a limit
 UNEVEN = "stamps jitter, samples do not"
@@ -39,7 +39,7 @@ def even(
     missing = np.concatenate([[0.0], np.cumsum(periods - 1.0)])
     if (np.abs(steps / np.median(steps) - periods) > settings.clear_share).any():
         period, phase, agree = _period(since, settings)
-        if agree < settings.least_agreement:
+        if agree < settings.min_agreement:
             return _by_level(stamp_s, k, settings)
         counted = np.rint((since - phase) / period) - k
         steady = median_filter(counted, settings.median_samples, mode="nearest")
@@ -85,7 +85,7 @@ def jitter(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     """Timestamp jitter of evenly taken samples as an effect; a share of one is all of it."""
     settings = pairs[0].settings.timestamps
     corrections = [(pair.stamp_s, even(pair.stamp_s, settings)[0] - pair.stamp_s) for pair in pairs]
-    if min(float(x.std()) for _, x in corrections) < settings.least_jitter_s:
+    if min(float(x.std()) for _, x in corrections) < settings.min_jitter_s:
         return ()
 
     def forward(taken_s: Float64[np.ndarray, " n"], theta: Theta) -> Float64[np.ndarray, " n"]:
@@ -104,7 +104,7 @@ def dropped(pairs: Sequence[Pair]) -> list[Finding]:
     for pair in pairs:
         missing, total = missing + even(pair.stamp_s, settings)[1], total + len(pair.stamp_s)
         length += float(pair.stamp_s[-1] - pair.stamp_s[0])
-    if missing < settings.least_missing:
+    if missing < settings.min_missing:
         return []
     share = Estimate(missing / (missing + total), float(np.sqrt(missing)) / (missing + total), "-")
     parameters = {"share": share, "missing": Estimate(float(missing), 0.0, "samples")}
@@ -117,9 +117,9 @@ def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Find
     settings, lsb = pairs[0].settings.timestamps, {}
     for k, signal in enumerate(("gyro", "accel")):
         axes = [pair.real[:, a] for pair in pairs for a in range(3 * k, 3 * k + 3)]
-        grids = [grid(x, settings) for x in axes if len(np.unique(x)) >= LEAST_VALUES] or [0.0]  # fewer lie on any grid
+        grids = [grid(x, settings) for x in axes if len(np.unique(x)) >= MIN_VALUES] or [0.0]  # fewer lie on any grid
         noise = float(np.sqrt(np.mean(floor[3 * k : 3 * k + 3] ** 2)))
-        if min(grids) > settings.least_digits * noise and max(grids) < 1.5 * min(grids):
+        if min(grids) > settings.min_digits * noise and max(grids) < 1.5 * min(grids):
             lsb[signal] = float(np.median(grids))
     if not lsb:
         return []
@@ -133,7 +133,7 @@ def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Find
 def grid(x: Float64[np.ndarray, " n"], settings: TimestampSettings = DEFAULT.timestamps) -> float:
     """Grid step of values; 0 where they lie on no grid or take fewer than three values."""
     values = np.unique(np.round(x, 12))
-    if len(values) < LEAST_VALUES:
+    if len(values) < MIN_VALUES:
         return 0.0
     step = float(np.diff(values).min())
     if step <= 0:
@@ -150,13 +150,13 @@ def limits(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAU
     highest, moves = dict[Sensor, float](), ~stuck(real)  # a dead axis has no limit
     for k, signal in enumerate(SENSORS):
         values, at, next_to = real[:, 3 * k : 3 * k + 3][:, moves[3 * k : 3 * k + 3]], 0, 0
-        most = float(np.abs(values).max(initial=0.0))
+        limit = float(np.abs(values).max(initial=0.0))
         for side in (values, -values):  # 16 bits end at -32768 and 32767
-            if (end := float(side.max(initial=0.0))) >= settings.clipped_share * most:
+            if (end := float(side.max(initial=0.0))) >= settings.clipped_share * limit:
                 below = side[side < end * (1.0 - 1e-9)]
                 at, next_to = at + side.size - below.size, next_to + int((below >= below.max(initial=0.0) * (1.0 - 1e-9)).sum())
-        if at >= settings.least_at_limit and at > settings.piled_factor * next_to:  # on a grid all come again, less at the ends
-            highest[signal] = most
+        if at >= settings.min_at_limit and at > settings.piled_factor * next_to:  # on a grid all come again, less at the ends
+            highest[signal] = limit
     return highest
 
 
@@ -170,10 +170,10 @@ def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]
         bias = np.mean([b[part] for b in biases], axis=0)
         for ahead, variant in ((bias, ("", "accel")[k]), (0.0 * bias, f"corrected {signal}")):
             real = [pair.real[:, part] - bias + ahead for pair in pairs]
-            most = float(max(np.abs(x).max() for x in real))
-            least = max(float(np.max(np.quantile(np.abs(x), READ) - NOISY * white_noise(x))) for x in real)
-            L = Parameter(f"{signal}_limit", UNITS[signal], most, positive=True, null_value=np.inf, step=1e-4, least=least)
-            starts, text = starts_at(*([share * most] for share in SHARES)), f"{signal} = clip({signal}, -L, L)"
+            limit = float(max(np.abs(x).max() for x in real))
+            lower = max(float(np.max(np.quantile(np.abs(x), READ) - NOISY * white_noise(x))) for x in real)
+            L = Parameter(f"{signal}_limit", UNITS[signal], limit, positive=True, null_value=np.inf, step=1e-4, minimum=lower)
+            starts, text = starts_at(*([share * limit] for share in SHARES)), f"{signal} = clip({signal}, -L, L)"
             given = "saturation", Stage.CONVERTER, (signal,), text, (L,), "the limit is reached", _Clip(k, ahead), False, starts
             candidates.append(Effect(*given, variant=variant))
     return tuple(candidates)
@@ -193,11 +193,11 @@ class _Clip:
 
 def clipped(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAULT.timestamps) -> Bool[np.ndarray, "n 6"]:
     """Clipped samples of an axis, and their neighbours, which filters mix with them."""
-    at, most = np.zeros(real.shape, bool), limits(real, settings)
+    at, highest = np.zeros(real.shape, bool), limits(real, settings)
     for k, signal in enumerate(("gyro", "accel")):
-        if signal in most:
+        if signal in highest:
             part = slice(3 * k, 3 * k + 3)
-            at[:, part] = np.abs(real[:, part]) >= settings.clipped_share * most[signal]
+            at[:, part] = np.abs(real[:, part]) >= settings.clipped_share * highest[signal]
     return np.asarray(binary_dilation(at, np.ones((5, 1), bool))) if at.any() else at
 
 
@@ -212,20 +212,20 @@ def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "_ 6
     powers, signal_of, p = [0.0, 0.0, 0.0], "", 1.0
     real, model = (np.concatenate(parts) for parts in ([pair.real for pair in pairs], expected))
     for k, signal in enumerate(SENSORS):
-        most = limits(real, settings).get(signal)
-        if most is None:
+        limit = limits(real, settings).get(signal)
+        if limit is None:
             continue
         part = slice(3 * k, 3 * k + 3)
-        at = np.abs(real[:, part]) >= most * (1.0 - settings.limit_error)
-        beyond = (model[:, part] * np.sign(real[:, part]))[at] > most
-        below = np.abs(real[:, part])[np.abs(real[:, part]) < most * (1.0 - 1e-9)].max(initial=0.0)
-        is_cut = most - below < FINER * white_noise(real[:, part]).max()  # no grid lets it recur; its bias may hide what is cut
+        at = np.abs(real[:, part]) >= limit * (1.0 - settings.limit_error)
+        beyond = (model[:, part] * np.sign(real[:, part]))[at] > limit
+        below = np.abs(real[:, part])[np.abs(real[:, part]) < limit * (1.0 - 1e-9)].max(initial=0.0)
+        is_cut = limit - below < FINER * white_noise(real[:, part]).max()  # no grid makes it recur; a bias may hide the cut
         chance = 0.0 if is_cut else float(binom.sf(beyond.sum() - 1, len(beyond), 0.5)) * tried
         if chance > 1e-2 and beyond.mean() < 0.9:
             continue
-        parameters[f"{signal}_limit"] = Estimate(most, settings.limit_error * most, UNITS[signal])
+        parameters[f"{signal}_limit"] = Estimate(limit, settings.limit_error * limit, UNITS[signal])
         before = ((real - model)[:, part] ** 2)[at]
-        after = ((real[:, part] - np.clip(model[:, part], -most, most)) ** 2)[at]
+        after = ((real[:, part] - np.clip(model[:, part], -limit, limit)) ** 2)[at]
         powers, signal_of, p = [float(before.sum()), float(after.sum()), float(at.size)], signal, min(p, chance)
     if not parameters:
         return []
@@ -241,7 +241,7 @@ def late_stamps(pairs: Sequence[Pair]) -> list[Finding]:
     """Finding of timestamp jitter, where stamps are uneven and the samples are even."""
     settings = pairs[0].settings.timestamps
     lateness = [pair.stamp_s - even(pair.stamp_s, settings)[0] for pair in pairs]
-    if min(float(x.std()) for x in lateness) < settings.least_jitter_s:
+    if min(float(x.std()) for x in lateness) < settings.min_jitter_s:
         return []
     logs = ((pair.real, late, pair.period_s) for pair, late in zip(pairs, lateness, strict=True))
     chance = _chance_of_following(logs, settings)
@@ -260,7 +260,7 @@ def without_jitter(
 ) -> Float64[np.ndarray, " n"]:
     """Stamps without jitter that the samples do not follow; holes and slow wander stay."""
     steps = np.diff(stamp_s)
-    if steps.std() < settings.least_jitter_s:
+    if steps.std() < settings.min_jitter_s:
         return stamp_s
     period_s = float(np.median(steps))
     late = stamp_s - stamp_s[0] - period_s * np.arange(len(stamp_s))
@@ -287,7 +287,7 @@ def _followed(
     column: Float64[np.ndarray, " n"], late_s: Float64[np.ndarray, " n"], period_s: float, settings: TimestampSettings
 ) -> tuple[float, float]:
     """Share of the stamps' lateness that the samples follow, and its inverse variance."""
-    if len(column) < LEAST_ROWS:
+    if len(column) < MIN_ROWS:
         return 0.0, 0.0
     line = settings.line_samples, settings.line_degree
     slope = savgol_filter(column, *line, deriv=1, delta=period_s)

@@ -199,14 +199,14 @@ def like(pairs: Sequence[Pair]) -> SensorSamples:
     return pair.ideal.sample(stamp_s, stamp_s)
 
 
-def with_finer_curve(logs: Sequence[WhitenedLog], now: Fit) -> Fit:
+def with_finer_curve(logs: Sequence[WhitenedLog], base: Fit) -> Fit:
     """Fit with more knots in the curve that has just come in, where an edge pays for them (BIC)."""
-    others, (effect, _) = now.chosen[:-1], now.chosen[-1]
+    others, (effect, _) = base.chosen[:-1], base.chosen[-1]
     fine = finer_curve(logs, effect) if isinstance(effect.forward, Curve) else None
     if fine is None:
-        return now
-    trial = fit(logs, (*others, (fine, fine.null_value.astype(float))), near=now)
-    return trial if bic(trial) < bic(now) - now.logs[0].pair.settings.search.clearly_better else now
+        return base
+    trial = fit(logs, (*others, (fine, fine.null_value.astype(float))), near=base)
+    return trial if bic(trial) < bic(base) - base.logs[0].pair.settings.search.clearly_better else base
 
 
 def finer_curve(logs: Sequence[WhitenedLog], curve: Effect) -> Effect | None:
@@ -234,7 +234,7 @@ def takes_noise(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog]) -> bo
         motion = motion - constant * (constant * motion).sum(axis=0) / np.maximum((constant**2).sum(axis=0), 1e-300)
         return np.asarray(-(motion * added).sum(axis=0) / np.maximum((motion**2).sum(axis=0), 1e-300))
 
-    return any(bool((taken(log) > log.pair.settings.search.most_taken).any()) for log in logs if log.pair.band_hz is not None)
+    return any(bool((taken(log) > log.pair.settings.search.max_taken).any()) for log in logs if log.pair.band_hz is not None)
 
 
 def _within_noise(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:
@@ -272,14 +272,14 @@ def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> boo
 
 def smoothing(found: Fit, first: int) -> Chosen:
     """Low-passes that only smooth what is left of a simulation's noise, without their lag."""
-    filters = [one for one in found.chosen[first:] if one[0].lagless and any(log.pair.denoised for log in found.logs)]
+    filters = [entry for entry in found.chosen[first:] if entry[0].lagless and any(log.pair.denoised for log in found.logs)]
     early = ((effect, theta) for effect, theta in filters if not is_late(found, effect))
     return tuple((effect.without_lag(theta), theta) for effect, theta in early if _only_smooths(effect, theta, found))
 
 
 def _only_smooths(effect: Effect, theta: Theta, found: Fit) -> bool:
     """Whether no lag is explained, nor more than a filter errs by (clocks without a common epoch hide a lag)."""
-    others, lagless = tuple(one for one in found.chosen if one[0] is not effect), (effect.without_lag(theta), theta)
+    others, lagless = tuple(entry for entry in found.chosen if entry[0] is not effect), (effect.without_lag(theta), theta)
     without, alike = (fit(found.logs, chosen, part=found.part) for chosen in (others, (*others, lagless)))
     gain, of_lag = without.objective - found.objective, alike.objective - found.objective
     if of_lag >= LAG_SHARE * gain:
@@ -289,11 +289,11 @@ def _only_smooths(effect: Effect, theta: Theta, found: Fit) -> bool:
 
 def _smoothed_squares(log: WhitenedLog, design: Design, part: str) -> float:
     """White squares that a low-pass takes from the noise that is left of a simulation; infinite if that is unknown."""
-    left, share = log.pair.noise_left, SMOOTHED_SHARE if isinstance(log.pair, Pair) else 1.0  # of a signal it is all noise
-    if left is None:
+    rest, share = log.pair.noise_left, SMOOTHED_SHARE if isinstance(log.pair, Pair) else 1.0  # of a signal it is all noise
+    if rest is None:
         return np.inf
     n, rate_hz = len(log.pair.real), 1.0 / log.pair.period_s
-    density = make_interp_spline(left.f_hz, left.density, k=1)(np.fft.rfftfreq(n, 1.0 / rate_hz).clip(max=left.f_hz[-1]))
+    density = make_interp_spline(rest.f_hz, rest.density, k=1)(np.fft.rfftfreq(n, 1.0 / rate_hz).clip(max=rest.f_hz[-1]))
     white = np.fft.rfft(np.random.default_rng(0).normal(scale=np.sqrt(rate_hz / 2.0), size=(n, log.pair.columns)), axis=0)
     noise = np.fft.irfft(np.sqrt(density) * white, n, axis=0)
     before, after = (log.whiten(x)[log.rows(part)] for x in (noise, smoothed(noise, rate_hz, design)))

@@ -24,7 +24,7 @@ from imutool.noise.bias_walk import without_walk
 
 Rows = Sequence[Float64[np.ndarray, " n"]] | Float64[np.ndarray, "r n"]
 MAD_TO_STD = 1.4826
-LEAST_STD = 1e-12
+MIN_STD = 1e-12
 AT_ONCE = 8  # values of a band in one product of matrices
 FORGOTTEN = 1e-12  # of the noise: its square would underflow
 
@@ -164,12 +164,12 @@ class WhitenedLog:
     ) -> Float64[np.ndarray, "m k"]:
         """White residuals of expected readings, bias included; columns as of other readings are taken from theirs."""
         columns = [column for _, block in blocks for column in block.T]
-        others, theirs = ([], None) if known is None else ([column for _, block in known[0] for column in block.T], known[1].T)
-        new = [k for k, column in enumerate(columns) if theirs is None or not np.array_equal(column, others[k])]
+        others, old = ([], None) if known is None else ([column for _, block in known[0] for column in block.T], known[1].T)
+        new = [k for k, column in enumerate(columns) if old is None or not np.array_equal(column, others[k])]
         white = self.whiten.rows([self.pair.real[:, k] - columns[k] for k in new], np.array(new, np.int64))
-        if theirs is None or len(new) == len(columns):
+        if old is None or len(new) == len(columns):
             return np.asarray(white.T)
-        out = theirs.copy()
+        out = old.copy()
         if new:
             out[new] = white
         return np.asarray(out.T)
@@ -196,7 +196,7 @@ def whitener(residual: Float64[np.ndarray, "n k"], usable: Bool[np.ndarray, "n .
         filters[axis] = burg(residual[:, axis], counts, order)
         white = lfilter(filters[axis], [1.0], residual[:, axis])[rows]
         robust = MAD_TO_STD * float(np.median(np.abs(white)))
-        std[axis] = max(robust, 0.5 * float(np.sqrt(np.mean(white**2))), LEAST_STD)
+        std[axis] = max(robust, 0.5 * float(np.sqrt(np.mean(white**2))), MIN_STD)
     return Whitener(filters, std)
 
 
@@ -205,16 +205,16 @@ def level(
     usable: Bool[np.ndarray, "n ..."],
     rate_hz: float,
     settings: NoiseSettings,
-    left: NoiseLeft | None = None,
+    noise_left: NoiseLeft | None = None,
     lsb: Float64[np.ndarray, " k"] | float = 0.0,
 ) -> Whitener:
-    """Whitening filters of a sensor beside an exact simulation, or above the band of its poses.
+    """Whitening filters of a sensor against an exact simulation, or above the band of its poses.
 
-    As `whitener`, but below `motion_hz` the noise is taken to be what it is above, and what is `left` of a simulation's own.
+    As `whitener`, but below `motion_hz` the noise is taken to be that above, with `noise_left` of a simulation's own.
     What is left down there may be physics that nobody thought of. No noise is less than LSB² / 12 of a simulation's digits.
     """
     filters, std = np.eye(1, settings.order + 1).repeat(residual.shape[1], axis=0), np.ones(residual.shape[1])
-    least = np.broadcast_to(np.square(lsb) / (6.0 * rate_hz), std.shape)
+    minimum = np.broadcast_to(np.square(lsb) / (6.0 * rate_hz), std.shape)
     for axis, counts in enumerate(_by_axis(usable, residual.shape[1])):
         if not counts.any():
             continue
@@ -222,9 +222,9 @@ def level(
         power = median_filter(power, settings.line_bins, mode="nearest")  # a line is no noise
         low, high = min(settings.motion_hz, 0.3 * rate_hz), min(settings.reference_hz, 0.45 * rate_hz)
         power[f_hz < low] = np.median(power[(f_hz >= low) & (f_hz <= high)])
-        if left is not None:
-            power[f_hz < low] += np.interp(f_hz[f_hz < low], left.f_hz, left.density[:, axis])
-        filters[axis], std[axis] = autoregression(np.maximum(power, least[axis]), rate_hz, settings.order)
+        if noise_left is not None:
+            power[f_hz < low] += np.interp(f_hz[f_hz < low], noise_left.f_hz, noise_left.density[:, axis])
+        filters[axis], std[axis] = autoregression(np.maximum(power, minimum[axis]), rate_hz, settings.order)
     return Whitener(filters, std)
 
 
@@ -232,9 +232,9 @@ def autoregression(power: Float64[np.ndarray, " f"], rate_hz: float, order: int)
     """Autoregression (1, a_1, ..., a_order) and innovation std from a density (Yule-Walker)."""
     from scipy.linalg import solve_toeplitz
 
-    covariance = np.fft.irfft(power * rate_hz / 2.0)[: order + 1] + np.concatenate([[LEAST_STD**2], np.zeros(order)])
+    covariance = np.fft.irfft(power * rate_hz / 2.0)[: order + 1] + np.concatenate([[MIN_STD**2], np.zeros(order)])
     a = -solve_toeplitz(covariance[:-1], covariance[1:]) if order else np.zeros(0)
-    return np.concatenate([[1.0], a]), float(np.sqrt(max(float(covariance[0] + a @ covariance[1:]), LEAST_STD**2)))
+    return np.concatenate([[1.0], a]), float(np.sqrt(max(float(covariance[0] + a @ covariance[1:]), MIN_STD**2)))
 
 
 def _by_axis(usable: Bool[np.ndarray, "n ..."], columns: int) -> Bool[np.ndarray, "k n"]:

@@ -31,17 +31,17 @@ from imutool.sensor.effects import vibration
 
 def compared(found: Selection, sim: Selection, of_sim: Sequence[Finding]) -> tuple[Selection, tuple[Finding, ...], str]:
     """Selection, findings of the simulation, and a remark; both logs in the same words."""
-    below = [within_model_error(one) for one in (found, sim)]
-    clear = [[one for one in each.selected if one not in small] for each, small in zip((found, sim), below, strict=True)]
+    below = [within_model_error(e) for e in (found, sim)]
+    clear = [[e for e in each.selected if e not in small] for each, small in zip((found, sim), below, strict=True)]
     both = [
-        [one for one in small if not any(_is_rival(one.effect, other.effect) for other in others)]
+        [e for e in small if not any(_is_rival(e.effect, other.effect) for other in others)]
         for small, others in zip(below, clear[::-1], strict=True)
     ]
-    found, sim = (without(one, {small.effect.key for small in each}) for one, each in zip((found, sim), both, strict=True))
-    left_out = {(one.effect.name, one.effect.equation) for one in both[1]}
+    found, sim = (without(e, {small.effect.key for small in each}) for e, each in zip((found, sim), both, strict=True))
+    left_out = {(e.effect.name, e.effect.equation) for e in both[1]}
     found = with_common_description(found, sim)
-    known = with_twins([one for one in of_sim if (one.effect, one.equation) not in left_out], sim, found)
-    names = ", ".join(dict.fromkeys(one.effect.name.replace("_", " ") for one in both[0]))
+    known = with_twins([e for e in of_sim if (e.effect, e.equation) not in left_out], sim, found)
+    names = ", ".join(dict.fromkeys(e.effect.name.replace("_", " ") for e in both[0]))
     return found, known, f"{names}: less than poses know of a motion, so not among the findings" if names else ""
 
 
@@ -55,11 +55,11 @@ def within_model_error(found: Selection) -> list[SelectedEffect]:
     squares = np.sum([_motion_squares(log) for log in logs], axis=0)
     signals = logs[0].pair.signals
     return [
-        one
-        for one in found.selected
-        if not one.effect.of_time
-        and one.effect.name != vibration.EFFECT.name
-        and one.gain < allowed * min(squares[signals[sensor]].sum() for sensor in one.effect.sensors)
+        e
+        for e in found.selected
+        if not e.effect.of_time
+        and e.effect.name != vibration.EFFECT.name
+        and e.gain < allowed * min(squares[signals[sensor]].sum() for sensor in e.effect.sensors)
     ]
 
 
@@ -68,20 +68,20 @@ def with_common_description(found: Selection, sim: Selection) -> Selection:
 
     They may leave more by `ALIKE_SHARE` of the size, as numbers may that are alike.
     """
-    mine, theirs = (_following(one.whole.chosen, one.always) for one in (found, sim))
-    if not mine or not theirs or {e.key for e, _ in mine} == {e.key for e, _ in theirs}:
+    own, other = (_following(x.whole.chosen, x.always) for x in (found, sim))
+    if not own or not other or {e.key for e, _ in own} == {e.key for e, _ in other}:
         return found
-    if not all(_is_comparable(effect, found.whole.logs) for effect, _ in theirs):
+    if not all(_is_comparable(effect, found.whole.logs) for effect, _ in other):
         return found
-    rest = tuple(entry for entry in found.whole.chosen if entry not in mine)
-    alone, trial = (fit(found.whole.logs, (*rest, *more), part="all") for more in ((), theirs))
+    rest = tuple(entry for entry in found.whole.chosen if entry not in own)
+    alone, trial = (fit(found.whole.logs, (*rest, *more), part="all") for more in ((), other))
     if trial.objective > found.whole.objective + ALIKE_SHARE**2 * (alone.objective - found.whole.objective):
         return found
-    first = max((one for one in found.selected if one.effect.name in FOLLOWING), key=lambda one: one.gain)
-    kept = [one for one in found.selected if one.effect.name not in FOLLOWING]
+    first = max((x for x in found.selected if x.effect.name in FOLLOWING), key=lambda x: x.gain)
+    kept = [x for x in found.selected if x.effect.name not in FOLLOWING]
     theta, std = _numbers(trial)
-    named = [replace(first, effect=e, theta=theta[e.key], std=std[e.key], unidentified=()) for e, _ in theirs]
-    kept = [replace(one, theta=theta[one.effect.key], std=std[one.effect.key]) for one in kept]
+    named = [replace(first, effect=e, theta=theta[e.key], std=std[e.key], unidentified=()) for e, _ in other]
+    kept = [replace(x, theta=theta[x.effect.key], std=std[x.effect.key]) for x in kept]
     return replace(found, selected=(*named, *kept), fitted=fit(found.fitted.logs, trial.chosen), whole=trial)
 
 
@@ -89,20 +89,20 @@ def with_twins(known: Sequence[Finding], sim: Selection, real: Selection) -> tup
     """Findings of a simulation, with the recording's effects in place of their rivals."""
     chosen, always, logs = sim.whole.chosen, sim.always, sim.whole.logs
     keys = {effect.key for effect, _ in chosen}
-    asked = [one for one in real.selected if _is_comparable(one.effect, logs)]
-    if not any(one.effect.key not in keys for one in asked):
+    asked = [x for x in real.selected if _is_comparable(x.effect, logs)]
+    if not any(x.effect.key not in keys for x in asked):
         return tuple(known)
-    rivals = {e.key for e, _ in chosen[always:] if any(_is_rival(e, one.effect) for one in asked)}
+    rivals = {e.key for e, _ in chosen[always:] if any(_is_rival(e, x.effect) for x in asked)}
     others = tuple(entry for entry in chosen if entry[0].key not in rivals)
-    begun = (*others, *((one.effect, one.theta) for one in asked))
+    begun = (*others, *((x.effect, x.theta) for x in asked))
     whole = fit(logs, begun, part="all")
     theta, std = _numbers(whole)
-    new = tuple(SelectedEffect(one.effect, theta[one.effect.key], std[one.effect.key], (), 1.0, 1.0, 0.0) for one in asked)
+    new = tuple(SelectedEffect(x.effect, theta[x.effect.key], std[x.effect.key], (), 1.0, 1.0, 0.0) for x in asked)
     selection = Selection(new, fit(sim.fitted.logs, whole.chosen), whole, sim.tried, always)
     floor = noise_floor(logs)
-    twins = [finding_of(logs, selection, one, floor) for one in new]
+    twins = [finding_of(logs, selection, x, floor) for x in new]
     replaced = {(e.name, e.equation) for e, _ in chosen if e.key in rivals}
-    return (*(one for one in known if (one.effect, one.equation) not in replaced), *twins)
+    return (*(x for x in known if (x.effect, x.equation) not in replaced), *twins)
 
 
 def _motion_squares(log: WhitenedLog) -> Float64[np.ndarray, " k"]:
@@ -117,9 +117,9 @@ def _following(chosen: Chosen, always: int) -> Chosen:
     return tuple(entry for entry in chosen[always:] if entry[0].name in FOLLOWING)
 
 
-def _is_rival(theirs: Effect, asked: Effect) -> bool:
+def _is_rival(effect: Effect, asked: Effect) -> bool:
     """Whether two effects are one word or two for the same thing."""
-    return exclude_each_other(theirs, asked) or (theirs.name in FOLLOWING and asked.name in FOLLOWING)
+    return exclude_each_other(effect, asked) or (effect.name in FOLLOWING and asked.name in FOLLOWING)
 
 
 def _is_comparable(effect: Effect, logs: Sequence[WhitenedLog]) -> bool:

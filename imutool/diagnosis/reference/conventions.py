@@ -42,7 +42,7 @@ def with_common_conventions(pairs: Sequence[Pair], of: str = "simulation") -> tu
             for each in ([pair.real for pair in pairs], [expected(pair, ()) for pair in pairs])
         )
         shown[sensor] = _convention(sensor, y, x)
-    changes = {sensor: one.beside(*(other for other in shown.values() if other is not one)) for sensor, one in shown.items()}
+    changes = {sensor: own.beside(*(other for other in shown.values() if other is not own)) for sensor, own in shown.items()}
     if all(factor == 1.0 and np.array_equal(P, np.eye(3)) for factor, P in changes.values()):
         return [*map(_with_z_up, pairs)], []
     after = [_with_z_up(_converted(pair, changes)) for pair in pairs]
@@ -66,13 +66,13 @@ class _Convention(NamedTuple):
 
     factor: float
     P: Matrix
-    left: float
+    misfit: float
     needed: bool
 
     def beside(self, other: _Convention) -> tuple[float, Matrix]:
         """Factor and axes, if they explain the motion; less of it where the other sensor shows the same axes."""
-        alike = other.left < EXPLAINED and np.array_equal(self.P, other.P)
-        if self.left > (EXPLAINED_AS_OTHER if alike else EXPLAINED):
+        alike = other.misfit < EXPLAINED and np.array_equal(self.P, other.P)
+        if self.misfit > (EXPLAINED_AS_OTHER if alike else EXPLAINED):
             return 1.0, np.eye(3)
         return self.factor, self.P if self.needed or (alike and other.needed) else np.eye(3)
 
@@ -87,12 +87,12 @@ def _convention(sensor: Sensor, y: Readings, x: Readings) -> _Convention:
     factor = next((by for by in (other, 1.0 / other) if like.unit(y, by) != 1.0), 1.0)
     _, P = like.frame(y * factor)
     turned = y @ P
-    left = factor * turned - x
+    misfit = factor * turned - x
     size = max(float((x**2).mean(axis=0).sum()), np.finfo(np.float64).tiny)
-    shown = sensor == "gyro" or float((left.mean(axis=0) ** 2).sum()) < CONSTANT * size
+    shown = sensor == "gyro" or float((misfit.mean(axis=0) ** 2).sum()) < CONSTANT * size
     shown &= _correlation(turned, x) > _correlation(y, x) - UNLIKE
     needed = float((factor * y - x).var(axis=0).sum()) > EXPLAINED * float(x.var(axis=0).sum())
-    return _Convention(factor, P, float(left.var(axis=0).sum()) / size, needed) if shown else same
+    return _Convention(factor, P, float(misfit.var(axis=0).sum()) / size, needed) if shown else same
 
 
 def _correlation(y: Readings, x: Readings) -> float:
@@ -142,8 +142,8 @@ def _finding(
     part = slice(3 * SENSORS.index(sensor), 3 * SENSORS.index(sensor) + 3)
 
     def rms(pairs: Sequence[Pair]) -> float:
-        left = [(pair.real - expected(pair, ()))[pair.held_out, part] for pair in pairs]
-        return float(np.sqrt(np.mean(np.concatenate(left) ** 2)))
+        residuals = [(pair.real - expected(pair, ()))[pair.held_out, part] for pair in pairs]
+        return float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
 
     was, is_now = rms(before), rms(after)
     seconds = round(sum(float(pair.held_out.sum()) * pair.period_s for pair in before), 1)

@@ -67,8 +67,8 @@ def align_all(
         remarks += [remark] if remark else []
         remarks += _held(recording, "the topic is faster than its sensor")
         remarks += batch_remark(recording)
-        if again := sum(int(repeats(pair.real).sum()) for pair in aligned):
-            remarks.append(f"{recording.name}: {again} samples repeat the one before on every axis, and do not count")
+        if repeated := sum(int(repeats(pair.real).sum()) for pair in aligned):
+            remarks.append(f"{recording.name}: {repeated} samples repeat the one before on every axis, and do not count")
         if straight := sum(int(filled(pair.stamp_s, pair.real).sum()) for pair in aligned):
             where = "lie on a straight line between their neighbours on every axis, as where a gap was filled"
             remarks.append(f"{recording.name}: {straight} samples {where}, and do not count")
@@ -77,7 +77,7 @@ def align_all(
             what = "its true poses cover" if sim is None else "the simulation covers"
             remarks.append(
                 f"{recording.name}: {what} {covered:.0f} of {recording.imu.duration_s:.0f} s "
-                f"in stretches of {settings.alignment.least_s:g} s or more without a hole; the rest was not looked at"
+                f"in stretches of {settings.alignment.min_s:g} s or more without a hole; the rest was not looked at"
             )
     if refused and not pairs and len(recordings) > 1:
         raise refused[0]
@@ -86,8 +86,8 @@ def align_all(
 
 def _held(recording: Recording, why: str) -> list[str]:
     """Remark on samples that repeat the one before, as a simulator or a driver holds them."""
-    held = len(recording.imu) - len(new_samples(recording).imu)
-    return [f"{recording.name}: {held} samples repeat gyro or accel of the one before, and do not count: {why}"] if held else []
+    n = len(recording.imu) - len(new_samples(recording).imu)
+    return [f"{recording.name}: {n} samples repeat gyro or accel of the one before, and do not count: {why}"] if n else []
 
 
 def without_unseen_offset(candidates: Sequence[Effect], pairs: Sequence[Pair]) -> tuple[tuple[Effect, ...], Chosen]:
@@ -95,9 +95,9 @@ def without_unseen_offset(candidates: Sequence[Effect], pairs: Sequence[Pair]) -
 
     What alignment by the motion leaves of it is no finding, but a filter or a delay cannot be fitted without it.
     """
-    offset = tuple(one for one in candidates if one.name == "clock_offset" and any(pair.aligned_s for pair in pairs))
-    kept = tuple(one for one in candidates if one not in offset)
-    return kept, tuple((one, one.null_value.astype(float)) for one in offset)
+    offset = tuple(e for e in candidates if e.name == "clock_offset" and any(pair.aligned_s for pair in pairs))
+    kept = tuple(e for e in candidates if e not in offset)
+    return kept, tuple((e, e.null_value.astype(float)) for e in offset)
 
 
 def clock_difference(pairs: Sequence[Pair], found: Fit) -> ClockDifference | None:
@@ -145,7 +145,7 @@ def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Seque
 
 def _compared(recordings: Sequence[Recording], settings: AlignmentSettings) -> Iterator[tuple[Recording, str]]:
     """First parts of recordings that together are too long, each with a remark; else the recordings."""
-    share = settings.most_samples / max(1, sum(len(recording.imu) for recording in recordings))
+    share = settings.max_samples / max(1, sum(len(recording.imu) for recording in recordings))
     for recording in recordings:
         t_ns = recording.imu.t_ns
         if share >= 1.0:
@@ -187,8 +187,8 @@ def _shared_stretches(real: Recording, sim: Recording) -> list[tuple[int, int, S
     if MOTION_TOPIC in real.truths:  # itself simulated, from exactly this motion
         return []
     for poses, other in product(real.truths.values(), sim.truths.values()):
-        _, mine, theirs = np.intersect1d(poses.t_ns, other.t_ns, return_indices=True)
-        if len(mine) > COPIED * len(other.t_ns) and np.array_equal(poses.p_wb[mine], other.p_wb[theirs]):
+        _, own_rows, other_rows = np.intersect1d(poses.t_ns, other.t_ns, return_indices=True)
+        if len(own_rows) > COPIED * len(other.t_ns) and np.array_equal(poses.p_wb[own_rows], other.p_wb[other_rows]):
             motion = smooth_motion(poses)
             start_ns, measured = motion.start_ns, [part for part in motion.stretches if part.measured]
             return [(start_ns + round(1e9 * p.start_s), start_ns + round(1e9 * p.end_s), p) for p in measured]
@@ -198,8 +198,8 @@ def _shared_stretches(real: Recording, sim: Recording) -> list[tuple[int, int, S
 def _shared_band_hz(pair: Pair, stretches: Sequence[tuple[int, int, Stretch]]) -> float:
     """Band of the stretches of poses that a simulation follows while it is compared; of all if none lasts."""
     end_ns = pair.start_ns + 1e9 * (pair.stamp_s[-1] - pair.stamp_s[0])
-    least_ns = 1e9 * pair.settings.alignment.least_s
-    last = [stretch for a, b, stretch in stretches if min(b, end_ns) - max(a, pair.start_ns) >= least_ns]
+    min_ns = 1e9 * pair.settings.alignment.min_s
+    last = [stretch for a, b, stretch in stretches if min(b, end_ns) - max(a, pair.start_ns) >= min_ns]
     return min(band_hz(stretch, pair.settings.reference) for stretch in last or [stretch for _, _, stretch in stretches])
 
 
@@ -224,12 +224,12 @@ def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
         return pair
     reduced = replace(pair, known=known)
     for part in (pair.fitted, pair.held_out):
-        known &= (known[part].sum(axis=0) * pair.period_s >= settings.least_known_s) | (known[part].all(axis=0))
+        known &= (known[part].sum(axis=0) * pair.period_s >= settings.min_known_s) | (known[part].all(axis=0))
     if not known.any():
         raise DataError(
             "; ".join(unusable_axes(reduced)),
             where=pair.name,
-            expected=f"{settings.least_known_s:g} s or more of an axis that moves within its range",
+            expected=f"{settings.min_known_s:g} s or more of an axis that moves within its range",
             fix="Record with a sensor that works, of a wider range or of finer digits",
         )
     return reduced
@@ -287,11 +287,11 @@ def unusable_axes(pair: Pair) -> list[str]:
     for a in np.flatnonzero(stuck & ~saturated):
         signal = SENSORS[a // 3]
         out.append(f"{signal} {AXES[a % 3]} reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample")
-    for signal, most in timestamps.limits(pair.real, pair.settings.timestamps).items():
+    for signal, maximum in timestamps.limits(pair.real, pair.settings.timestamps).items():
         k = 3 * SENSORS.index(signal)
         share = ", ".join(f"{AXES[a - k]} in {percent(float(clipped[a]))}" for a in range(k, k + 3) if saturated[a])
         if share:
-            out.append(f"{signal} is at its limit of {most:.4g} {UNITS[signal]}: {share} of the samples")
+            out.append(f"{signal} is at its limit of {maximum:.4g} {UNITS[signal]}: {share} of the samples")
     return out
 
 

@@ -9,7 +9,7 @@ is misaligned, R_ref = R_wb Exp(turned): means of the gyro over seconds are turn
 mount does that, which turns slow and fast motion alike.
 
 Poses that were smoothed turn and move less than the body where that is fast. To first order a symmetric filter of variance s²
-takes s²/2 times the second derivative; without it, a gyro beside such poses seems to have a scale.
+takes s²/2 times the second derivative; without it, a gyro against such poses seems to have a scale.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -
     outside = white[~inside]
     at = t_s[0] + block_s * np.arange(len(count))
     both = all(loud[:, (at >= a - 1e-6) & (at < b)].any(axis=1).all() and b - a <= settings.longest_s for a, b in runs)
-    few = len(runs) <= settings.most_intervals and inside.mean() <= settings.most_of_time
+    few = len(runs) <= settings.max_intervals and inside.mean() <= settings.max_of_time
     if not runs or not both or not few or (outside**2).mean() > settings.quiet_chi_square:
         return [], ()
     excess = (white[inside] ** 2).sum() - 6.0 * inside.sum()
@@ -189,7 +189,7 @@ def turned_reference(logs: Sequence[WhitenedImu], chosen: Chosen, settings: Refe
         return []
     means = [_slow_means(log, chosen, settings.turned_block_s) for log in logs]
     residual, signal = (np.concatenate([part[k] for part in means]) for k in (0, 1))
-    if len(residual) < settings.least_turned_blocks:
+    if len(residual) < settings.min_turned_blocks:
         return []
     turned, C_gyro, share = _rotation(residual[:, :3], signal[:, :3])
     by_gravity, C_gravity, _ = _rotation(residual[:, 3:], signal[:, 3:])
@@ -198,7 +198,7 @@ def turned_reference(logs: Sequence[WhitenedImu], chosen: Chosen, settings: Refe
     alike = chi2.sf(off @ np.linalg.solve(C_gyro + C_gravity, off), 3) > settings.turned_alike_p_value
     std = np.sqrt(np.diag(C_gyro))
     clear = np.where(np.abs(turned) > CLEAR * std, turned, 0.0)
-    large = np.linalg.norm(clear) > settings.least_turned_rad and share > settings.least_turned_share
+    large = np.linalg.norm(clear) > settings.min_turned_rad and share > settings.min_turned_share
     if p_value > settings.p_value or not alike or not large:
         return []
     (mount,) = catalogue.diagnosed(["mount_rotation"])
@@ -237,7 +237,7 @@ def _rotation(residual: Float64[np.ndarray, "b 3"], signal: Float64[np.ndarray, 
     information = np.einsum("bkp,bkq->pq", J, J)
     information += 1e-9 * np.trace(information) * np.eye(3)
     rotation = np.linalg.solve(information, np.einsum("bkp,bk->p", J, y))
-    left = y - np.einsum("bkp,p->bk", J, rotation)
-    scores = np.einsum("bkp,bk->bp", J, left)
+    remaining = y - np.einsum("bkp,p->bk", J, rotation)
+    scores = np.einsum("bkp,bk->bp", J, remaining)
     C = np.linalg.solve(information, np.linalg.solve(information, scores.T @ scores).T) * len(y) / max(len(y) - 2, 1)
-    return rotation, C, 1.0 - float((left**2).sum() / max((y**2).sum(), 1e-300))
+    return rotation, C, 1.0 - float((remaining**2).sum() / max((y**2).sum(), 1e-300))

@@ -49,7 +49,7 @@ def align_with_poses(real: Recording, settings: DiagnoseSettings) -> Iterator[Pa
         pairs = plain if _is_followed(plain, pairs) else pairs
     if not pairs:
         raise DataError(
-            f"the true poses have no stretch of {settings.alignment.least_s:g} s that can be differentiated",
+            f"the true poses have no stretch of {settings.alignment.min_s:g} s that can be differentiated",
             where=real.name,
             expected="poses at 40 Hz or more, without holes",
             fix="Give a simulation with `sim`",
@@ -71,7 +71,7 @@ def _with_z_up(real: Recording) -> Recording:
 
 def band_hz(stretch: Stretch, settings: ReferenceSettings) -> float:
     """Frequency up to which the motion of a stretch of poses is known."""
-    return max(settings.band_share * min(stretch.cutoff_hz), settings.least_band_hz)
+    return max(settings.band_share * min(stretch.cutoff_hz), settings.min_band_hz)
 
 
 def is_in_raw_poses(pair: Pair, line: Float64[np.ndarray, "n 6"], f_hz: float) -> bool:
@@ -86,11 +86,11 @@ def is_in_raw_poses(pair: Pair, line: Float64[np.ndarray, "n 6"], f_hz: float) -
 
 
 def _pairs(real: Recording, motion: SmoothMotion, settings: DiagnoseSettings) -> Iterator[Pair]:
-    least_s, started_ns = settings.alignment.least_s, int(real.imu.t_ns[0])
+    min_s, started_ns = settings.alignment.min_s, int(real.imu.t_ns[0])
     for ideal in motion.ideal_motions(1.0 / real.imu.period_s):
         # times are told from the log's start, also where its poses begin earlier or later
         since = replace(ideal, t_s=ideal.t_s + (motion.start_ns - started_ns) * 1e-9)
-        if min(since.t_s[-1], real.imu.duration_s) - max(since.t_s[0], 0.0) < least_s:
+        if min(since.t_s[-1], real.imu.duration_s) - max(since.t_s[0], 0.0) < min_s:
             continue
         middle_s = (ideal.t_s[0] + ideal.t_s[-1]) / 2.0
         stretch = next(part for part in motion.stretches if part.start_s <= middle_s <= part.end_s)
@@ -119,11 +119,11 @@ def _is_followed(plain: Sequence[Pair], robust: Sequence[Pair]) -> bool:
 
 def _products(plain: Pair, robust: Pair) -> Float64[np.ndarray, "b 2 2"]:
     """Products of the rest with the difference of the curves, and its squares, by block of time and sensor."""
-    t_s, mine, theirs = np.intersect1d(plain.stamp_s, robust.stamp_s, return_indices=True)
+    t_s, plain_rows, robust_rows = np.intersect1d(plain.stamp_s, robust.stamp_s, return_indices=True)
     if not len(t_s):
         return np.zeros((0, 2, 2))
-    motion = expected(robust, ())[theirs]
-    differs, rest = (expected(plain, ())[mine] - motion) * robust.axes, robust.real[theirs] - motion
+    motion = expected(robust, ())[robust_rows]
+    differs, rest = (expected(plain, ())[plain_rows] - motion) * robust.axes, robust.real[robust_rows] - motion
     rest = rest - np.median(rest, axis=0)
     block = ((t_s - t_s[0]) / robust.settings.search.held_out_block_s).astype(int)
     each = [[(x[:, part] * differs[:, part]).sum(axis=1) for part in robust.signals.values()] for x in (rest, differs)]

@@ -19,7 +19,7 @@ from imutool.recording.columns import true_ranges
 
 SELDOM = 0.1  # of the samples of an axis that are equal to the one before: digits are finer than the noise
 MOSTLY_NEW = 0.3  # of the samples that repeat the one before: more is a topic that is faster than its sensor
-LEAST_NEW = 0.05  # of the samples with news of both sensors: two that take turns have none
+MIN_NEW = 0.05  # of the samples with news of both sensors: two that take turns have none
 STRAIGHT = 1e-3  # of the median change of the slope, up to which three samples are on a line: float32 rounds far less
 STUCK = 10  # samples in a row that a sensor stands still, and is not held
 MOSTLY_COMMON, OWN_NOISE = 0.5, 0.1  # of the stamps of a simulation; of the noise, that two logs of one sample differ by
@@ -31,17 +31,17 @@ def new_samples(recording: Recording) -> Recording:
 
     Half of the samples of a gyro at half of the rate are late by a sample, and look like a low-pass.
     """
-    held = np.zeros(len(recording.imu), bool)
+    repeated = np.zeros(len(recording.imu), bool)
     for sensor in (recording.imu.gyro, recording.imu.accel):
         equal = np.concatenate([np.zeros((1, 3), bool), np.diff(sensor, axis=0) == 0])[: len(sensor)]
-        again = np.asarray(equal.all(axis=1))
-        for start, end in true_ranges(again):
-            again[start:end] = end - start < STUCK
-        if again.any() and again.mean() >= MOSTLY_NEW and equal[~again].mean(axis=0).max() < SELDOM:
-            held |= again
-    if not held.any() or (~held).mean() < LEAST_NEW:
+        equal_rows = np.asarray(equal.all(axis=1))
+        for start, end in true_ranges(equal_rows):
+            equal_rows[start:end] = end - start < STUCK
+        if equal_rows.any() and equal_rows.mean() >= MOSTLY_NEW and equal[~equal_rows].mean(axis=0).max() < SELDOM:
+            repeated |= equal_rows
+    if not repeated.any() or (~repeated).mean() < MIN_NEW:
         return recording
-    return replace(recording, imu=recording.imu.rows(~held))
+    return replace(recording, imu=recording.imu.rows(~repeated))
 
 
 def repeats(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
@@ -51,9 +51,9 @@ def repeats(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
     coarser than the noise repeat by themselves.
     """
     equal = np.concatenate([np.zeros((1, 6), bool), np.diff(real, axis=0) == 0])[: len(real)]
-    again = equal.all(axis=1)
-    by_chance = equal[~again].mean(axis=0) if (~again).any() else np.ones(6)
-    return np.asarray(again & bool(by_chance.max() < SELDOM and again.mean() < MOSTLY_NEW))
+    repeated = equal.all(axis=1)
+    by_chance = equal[~repeated].mean(axis=0) if (~repeated).any() else np.ones(6)
+    return np.asarray(repeated & bool(by_chance.max() < SELDOM and repeated.mean() < MOSTLY_NEW))
 
 
 def filled(stamp_s: Float64[np.ndarray, " n"], real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:

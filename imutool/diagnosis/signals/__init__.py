@@ -134,8 +134,8 @@ def _with_signal(diagnosis: Diagnosis, added: SignalDiagnosis) -> Diagnosis:
 
 def _with_remark(remarks: tuple[str, ...], remark: str) -> tuple[str, ...]:
     """Adds a remark on a signal; signals with the same remark share it."""
-    name, _, said = remark.partition(": ")
-    for k, one in enumerate(remarks):
-        if (names := one.removesuffix(f": {said}")) != one:
-            return (*remarks[:k], f"{names}, {name}: {said}", *remarks[k + 1 :])
+    name, _, text = remark.partition(": ")
+    for k, text_of_all in enumerate(remarks):
+        if (names := text_of_all.removesuffix(f": {text}")) != text_of_all:
+            return (*remarks[:k], f"{names}, {name}: {text}", *remarks[k + 1 :])
     return (*remarks, remark)

@@ -31,7 +31,7 @@ from imutool.sensor.robot_effects.joint_dynamics import Dynamics
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, SignalSamples
 from imutool.sensor.robot_effects.signal_sizes import Scale, moved
 
-TIME_CONSTANTS, MOST_SETTLING = 8.0, 0.25  # to 0.03 % of a step; of the log's time
+TIME_CONSTANTS, MAX_SETTLING = 8.0, 0.25  # to 0.03 % of a step; of the log's time
 MOVES = 1e-9  # of its largest value, below which a signal is constant
 Column = Float64[np.ndarray, "_"]
 STATE_WORDS = {"dq": "speed of joint {}", "ddq": "acceleration of joint {}", "speed": "speed"}
@@ -116,7 +116,7 @@ class AlignedSignal(AlignedLog):
         cutoffs = [float(theta[0]) for effect, theta in chosen if effect.name == "low_pass"]
         if not cutoffs:
             return self
-        length_s = min(TIME_CONSTANTS / (2.0 * np.pi * min(cutoffs)), MOST_SETTLING * float(np.ptp(self.stamp_s)))
+        length_s = min(TIME_CONSTANTS / (2.0 * np.pi * min(cutoffs)), MAX_SETTLING * float(np.ptp(self.stamp_s)))
         known = self.stamp_s - self.ideal.start_s > length_s
         return replace(self, fitted=self.fitted & known, held_out=self.held_out & known)
 
@@ -238,11 +238,11 @@ def _refuse_little(t_s: Column, name: str, settings: SignalSettings) -> None:
         DataError: less than the settings say.
     """
     shared_s = float(t_s[-1] - t_s[0]) if len(t_s) > 1 else 0.0
-    if shared_s < settings.least_s or len(t_s) < settings.least_samples:
+    if shared_s < settings.min_s or len(t_s) < settings.min_samples:
         raise DataError(
             f"{shared_s:.1f} s and {len(t_s)} samples of {name} are shared with the simulation",
             where=name,
-            expected=f"at least {settings.least_s:g} s and {settings.least_samples} samples",
+            expected=f"at least {settings.min_s:g} s and {settings.min_samples} samples",
             fix="Give logs of the same time, or longer ones",
         )
 
@@ -254,11 +254,11 @@ def _check(t_ns: Int64[np.ndarray, " n"], values: Column, what: str, name: str, 
         DataError: too short, not finite, stamps that do not increase, constant.
     """
     length = float(t_ns[-1] - t_ns[0]) * 1e-9 if len(t_ns) else 0.0
-    if length < settings.least_s or len(t_ns) < settings.least_samples:
+    if length < settings.min_s or len(t_ns) < settings.min_samples:
         raise DataError(
             f"the {what} has {len(t_ns)} samples of {name} in {length:.1f} s",
             where=name,
-            expected=f"at least {settings.least_s:g} s and {settings.least_samples} samples",
+            expected=f"at least {settings.min_s:g} s and {settings.min_samples} samples",
             fix="Give a longer log",
         )
     if not np.isfinite(values).all() or (np.diff(t_ns) <= 0).any():

@@ -24,7 +24,7 @@ from imutool.sensor.robot_effects.joint_dynamics import WELL_DETERMINED, Dynamic
 from imutool.sensor.robot_effects.signal_samples import IdealSignal
 from imutool.sensor.robot_effects.wheel import WheelRelation
 
-MOST_FINE, STEP_ROUNDS = 20_000_000, 3  # samples; until the half step of a simulator is known
+MAX_FINE, STEP_ROUNDS = 20_000_000, 3  # samples; until the half step of a simulator is known
 WIDER, FILTER_PERIODS = 2.0, 2.0  # of a motion's filter: it changes nothing within the band
 SEGMENT = 512  # samples of a velocity's spectrum
 WAY_S, CONTRADICTS, WHOLE = 1.0, 0.5, 0.8  # of a way, the share by which two may differ, and of its samples without a gap
@@ -74,8 +74,8 @@ class SignalPair:
     ) -> SignalPair:
         """Fields of one message, at the stamps that all of them have."""
         names = tuple(f"{topic}.{path}" for path in paths)
-        (real_ns, mine), (sim_ns, theirs) = (stacked([side[path] for path in paths]) for side in (real, sim))
-        return cls(topic, names, units, real_ns, mine, sim_ns, theirs, kind, state, sim_state or {})
+        (real_ns, real_values), (sim_ns, sim_values) = (stacked([side[path] for path in paths]) for side in (real, sim))
+        return cls(topic, names, units, real_ns, real_values, sim_ns, sim_values, kind, state, sim_state or {})
 
 
 def stacked(columns: Sequence[Fields]) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
@@ -113,11 +113,11 @@ def at_recorded_motion(
             )
         ahead_s += time_ahead_s(relation(simulated), pair.sim[inside], own_s[inside])
     assert relation is not None
-    left = pair.sim[inside] - relation(simulated)
+    residual = pair.sim[inside] - relation(simulated)
     t_s, rate_hz, state = motion(pair.state, settings)
     first_s = float(seconds(next(iter(pair.state.values())).t_ns[:1], int(pair.real_ns[0]))[0])
     ideal = IdealSignal(float(t_s[0]) + first_s - ahead_s, rate_hz, relation(state), channels, state, relation)
-    return ideal, 2.0 * float(np.median(np.diff(own_s))) * left.var(axis=0)
+    return ideal, 2.0 * float(np.median(np.diff(own_s))) * residual.var(axis=0)
 
 
 def simulated_motion(pair: SignalPair, settings: DiagnoseSettings) -> tuple[dict[str, Column], Float64[np.ndarray, "n k"]]:
@@ -162,10 +162,10 @@ def _refuse_contradictory(state: Mapping[str, Fields], pair: SignalPair, log: st
         gone = np.interp(at_s, own_s, cumulative_trapezoid(velocity.values, own_s, initial=0))
         counts = np.array([np.diff(np.searchsorted(stamps, at_s)) for stamps in (t_s, own_s)])
         whole = (counts > WHOLE * counts.max(axis=1, initial=0, keepdims=True)).all(axis=0)
-        ways = np.diff([np.interp(at_s, t_s, position.values), gone], axis=1)[:, whole]
-        if ways.size:
-            by_position, by_velocity, apart = np.sqrt((np.stack([*ways, ways[1] - ways[0]]) ** 2).mean(axis=1))
-            share = float(apart / max(by_position, by_velocity, position.values.std(), 1e-300))
+        paths = np.diff([np.interp(at_s, t_s, position.values), gone], axis=1)[:, whole]
+        if paths.size:
+            by_position, by_velocity, difference = np.sqrt((np.stack([*paths, paths[1] - paths[0]]) ** 2).mean(axis=1))
+            share = float(difference / max(by_position, by_velocity, position.values.std(), 1e-300))
             contradictions.append((share, by_velocity, by_position, pair.names[int(label.removeprefix("q"))]))
     share, by_velocity, by_position, name = max(contradictions, default=(0.0, 0.0, 0.0, ""))
     if share > CONTRADICTS:
@@ -212,9 +212,9 @@ def band_hz(fields: Mapping[str, Fields], rate_hz: float, settings: SignalSettin
 
     A motion that is faster, as where a controller oscillates, is compared as far as its samples can be differentiated.
     """
-    most_hz = settings.motion_band_share * rate_hz
-    slow_hz = min(settings.motion_band_hz, most_hz)
-    return most_hz if _faster(fields, rate_hz, slow_hz) > settings.motion_beyond_band else slow_hz
+    max_hz = settings.motion_band_share * rate_hz
+    slow_hz = min(settings.motion_band_hz, max_hz)
+    return max_hz if _faster(fields, rate_hz, slow_hz) > settings.motion_beyond_band else slow_hz
 
 
 def _faster(fields: Mapping[str, Fields], rate_hz: float, above_hz: float) -> float:
@@ -236,10 +236,10 @@ def _refuse_fast(pair: SignalPair, settings: SignalSettings) -> None:
     """
     for state, log in ((pair.state, "recording"), (pair.sim_state, "simulation")):
         rate_hz = 1e9 / float(np.median(np.diff(next(iter(state.values())).t_ns)))
-        most_hz = settings.motion_band_share * rate_hz
-        if (share := _faster(state, rate_hz, most_hz)) > settings.motion_beyond_band:
+        max_hz = settings.motion_band_share * rate_hz
+        if (share := _faster(state, rate_hz, max_hz)) > settings.motion_beyond_band:
             raise DataError(
-                f"{share:.0%} of the squared velocities of {pair.name} in the {log} are faster than {most_hz:.3g} Hz, as where"
+                f"{share:.0%} of the squared velocities of {pair.name} in the {log} are faster than {max_hz:.3g} Hz, as where"
                 " a controller oscillates",
                 where=pair.name,
                 expected=f"a motion that {rate_hz:.4g} samples a second can be differentiated for",
@@ -255,8 +255,8 @@ def _slope(t_s: Column, values: Column) -> Column:
 def _wheels(state: Mapping[str, Column], columns: Float64[np.ndarray, "_ k"], _: WheelRelation | None) -> WheelRelation | None:
     speeds = np.stack(list(state.values()), axis=1)
     weights = np.linalg.lstsq(speeds, columns, rcond=None)[0]
-    left = (columns - speeds @ weights).std(axis=0)
-    return WheelRelation(weights) if (left < WELL_DETERMINED * columns.std(axis=0)).all() else None
+    residual_std = (columns - speeds @ weights).std(axis=0)
+    return WheelRelation(weights) if (residual_std < WELL_DETERMINED * columns.std(axis=0)).all() else None
 
 
 RELATIONS: Mapping[str, Callable[[Any, Any, Any], Dynamics | WheelRelation | None]] = {"efforts": identified, "wheels": _wheels}
@@ -273,7 +273,7 @@ def from_simulation(
 ) -> tuple[IdealSignal, Float64[np.ndarray, " k"]]:
     """The simulation without white noise on a fine clock, and the density of that noise."""
     t_even = t_sim[0] + period_sim * np.arange(int((t_sim[-1] - t_sim[0]) / period_sim) + 1)
-    rate_hz = min(rate_hz, MOST_FINE / (t_even[-1] - t_even[0]))
+    rate_hz = min(rate_hz, MAX_FINE / (t_even[-1] - t_even[0]))
     t_fine = t_even[0] + np.arange(int((t_even[-1] - t_even[0]) * rate_hz) + 1) / rate_hz
     fine, density = [], []
     for column in values.T:

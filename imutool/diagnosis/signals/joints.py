@@ -21,9 +21,9 @@ from imutool.recording import seconds
 JOINTS = "sensor_msgs/msg/JointState"
 JOINT_UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
 SPEEDS = ("twist.twist.linear.x", "twist.twist.angular.z")
-LEAST_MOVED = 1e-3  # rad or m: a joint that moves less shows nothing of its dynamics
-LEAST_EFFORTS = 0.5  # of the joints, that have efforts where efforts are compared
-LEAST_RATES, SLOWER_HZ, RATE_ERROR = 100, 0.1, 0.003  # samples; of a drift that integration makes; share of a motion
+MIN_MOVED = 1e-3  # rad or m: a joint that moves less shows nothing of its dynamics
+MIN_EFFORTS = 0.5  # of the joints, that have efforts where efforts are compared
+MIN_RATES, SLOWER_HZ, RATE_ERROR = 100, 0.1, 0.003  # samples; of a drift that integration makes; share of a motion
 DRIVES = 0.05  # of a vehicle's speed or turning, that a wheel makes
 
 
@@ -54,46 +54,46 @@ def by_joint(fields: Mapping[str, Fields], wanted: Sequence[str], given: Sequenc
     return {f"{word}{index[f'[{rest}']}": fields[path] for path, (word, _, rest) in split.items() if f"[{rest}" in index}
 
 
-def joint_remarks(topic: str, mine: Sequence[str], other: Sequence[str]) -> list[str]:
+def joint_remarks(topic: str, real: Sequence[str], sim: Sequence[str]) -> list[str]:
     """Names of the indices that findings have, and joints of one log alone."""
-    if not mine:
+    if not real:
         return []
-    out = [f"Joints of {topic}: {', '.join(f'[{k}] {name}' for k, name in enumerate(mine))}"]
-    alone = [name for name in mine if name not in other], [name for name in other if name not in mine]
-    if other and len(alone[0]) == len(mine):
+    out = [f"Joints of {topic}: {', '.join(f'[{k}] {name}' for k, name in enumerate(real))}"]
+    alone = [name for name in real if name not in sim], [name for name in sim if name not in real]
+    if sim and len(alone[0]) == len(real):
         return [*out, f"No joint of {topic} has a name of the simulation's: joints were compared by their order"]
     for names, log in zip(alone, ("recording", "simulation"), strict=True):
-        out += [f"Only the {log} has the joints {', '.join(names)}: they were not compared"] if names and other else []
+        out += [f"Only the {log} has the joints {', '.join(names)}: they were not compared"] if names and sim else []
     return out
 
 
 def joint_pairs(
-    topic: str, mine: Mapping[str, Fields], other: Mapping[str, Fields], wheels: Collection[str]
+    topic: str, real: Mapping[str, Fields], sim: Mapping[str, Fields], wheels: Collection[str]
 ) -> Iterator[SignalPair]:
     """Efforts with the motion of the joints where both logs have both, else each number alone.
 
     `wheels` are indices of joints that are compared with the vehicle.
     """
-    both = [path for path in other if path in mine and not path.endswith(tuple(wheels))]  # in the order of the model
+    both = [path for path in sim if path in real and not path.endswith(tuple(wheels))]  # in the order of the model
     joints = [path.removeprefix("position") for path in both if path.startswith("position")]
     driven = [k for k in joints if f"effort{k}" in both]
-    moving = [k for k in driven if min(np.ptp(side[f"position{k}"].values) for side in (mine, other)) > LEAST_MOVED]
-    if moving and len(driven) >= LEAST_EFFORTS * len(joints):
-        yield _efforts(topic, moving, mine, other)
+    moving = [k for k in driven if min(np.ptp(side[f"position{k}"].values) for side in (real, sim)) > MIN_MOVED]
+    if moving and len(driven) >= MIN_EFFORTS * len(joints):
+        yield _efforts(topic, moving, real, sim)
         return
-    known = rates(mine, other)
+    known = rates(real, sim)
     for path in (path for path in both if path not in known):
         kind = "positions" if path.startswith("position") else "number"
-        effort = mine.get(path.replace("position", "effort"))
+        effort = real.get(path.replace("position", "effort"))
         state = {"effort": effort} if kind == "positions" and effort is not None else {}
-        pair = SignalPair.of_fields(mine[path], other[path], f"{topic}.{path}")
+        pair = SignalPair.of_fields(real[path], sim[path], f"{topic}.{path}")
         yield unwrapped(replace(pair, kind=kind, state=state, units=(JOINT_UNITS[path.partition("[")[0]],)))
 
 
-def rates(mine: Mapping[str, Fields], other: Mapping[str, Fields]) -> list[str]:
+def rates(real: Mapping[str, Fields], sim: Mapping[str, Fields]) -> list[str]:
     """Recorded velocities that are the rates of positions which both logs hold."""
-    found = [(path, path.replace("velocity", "position")) for path in mine if path.startswith("velocity") and path in other]
-    return [path for path, of in found if of in mine and of in other and _is_rate(mine[path], mine[of])]
+    found = [(path, path.replace("velocity", "position")) for path in real if path.startswith("velocity") and path in sim]
+    return [path for path, of in found if of in real and of in sim and _is_rate(real[path], real[of])]
 
 
 def _is_rate(velocity: Fields, position: Fields) -> bool:
@@ -101,22 +101,22 @@ def _is_rate(velocity: Fields, position: Fields) -> bool:
 
     What its integral leaves of the position, but for white noise, is compared with the position's motion.
     """
-    if len(position) < LEAST_RATES or not np.array_equal(velocity.t_ns, position.t_ns):
+    if len(position) < MIN_RATES or not np.array_equal(velocity.t_ns, position.t_ns):
         return False
     t_s = seconds(position.t_ns, int(position.t_ns[0]))
     period_s = float(np.median(np.diff(t_s)))
     slow = butter(2, min(2.0 * SLOWER_HZ * period_s, 0.5), "highpass", output="sos")
     gone = cumulative_trapezoid(velocity.values, t_s, initial=0)
-    q, left, v = sosfiltfilt(slow, np.stack([position.values, position.values - gone, velocity.values], axis=1), axis=0).T
-    left = left - float(np.clip(left @ v / max(v @ v, 1e-300), -period_s, period_s)) * v
-    noise = float(white_noise(left[:, None])[0])
-    return bool(left.var() - noise**2 < RATE_ERROR**2 * q.var())
+    q, residual, v = sosfiltfilt(slow, np.stack([position.values, position.values - gone, velocity.values], axis=1), axis=0).T
+    residual = residual - float(np.clip(residual @ v / max(v @ v, 1e-300), -period_s, period_s)) * v
+    noise = float(white_noise(residual[:, None])[0])
+    return bool(residual.var() - noise**2 < RATE_ERROR**2 * q.var())
 
 
-def _efforts(topic: str, moving: Sequence[str], mine: Mapping[str, Fields], other: Mapping[str, Fields]) -> SignalPair:
+def _efforts(topic: str, moving: Sequence[str], real: Mapping[str, Fields], sim: Mapping[str, Fields]) -> SignalPair:
     """Efforts of the joints that move, with the motion of all of them, at the stamps that all fields have."""
     states, sides = list[dict[str, Fields]](), list[dict[str, Fields]]()
-    for side in (mine, other):
+    for side in (real, sim):
         paths = [f"{word}{k}" for k in moving for word in JOINT_UNITS if f"{word}{k}" in side]
         t_ns, values = stacked([side[path] for path in paths])
         columns = (
@@ -133,24 +133,24 @@ def _efforts(topic: str, moving: Sequence[str], mine: Mapping[str, Fields], othe
 
 def wheel_pair(
     topic: str,
-    mine: Mapping[str, Fields],
-    other: Mapping[str, Fields],
+    real: Mapping[str, Fields],
+    sim: Mapping[str, Fields],
     joints: tuple[Mapping[str, Fields], Mapping[str, Fields]],
 ) -> tuple[SignalPair, list[str]] | None:
     """Speeds of a vehicle with those of the joints that drive it, and their indices.
 
     None where a log lacks one or the other, or where fewer than two joints drive.
     """
-    if not all(path in side for path in SPEEDS for side in (mine, other)):
+    if not all(path in side for path in SPEEDS for side in (real, sim)):
         return None
     speeds = [_speeds(side) for side in joints]
     shared = [k for k in speeds[0] if k in speeds[1]]
-    t_ns, moved = stacked([other[path] for path in SPEEDS])
+    t_ns, moved = stacked([sim[path] for path in SPEEDS])
     shared = [k for k, drives in zip(shared, _driving([speeds[1][k] for k in shared], t_ns, moved), strict=True) if drives]
     if len(shared) < 2:
         return None
     states = [{f"w{n}": values for n, values in enumerate(_together([side[k] for k in shared]))} for side in speeds]
-    return SignalPair.of_columns(topic, SPEEDS, "wheels", ("m/s", "rad/s"), mine, other, *states), shared
+    return SignalPair.of_columns(topic, SPEEDS, "wheels", ("m/s", "rad/s"), real, sim, *states), shared
 
 
 def _together(columns: Sequence[Fields]) -> list[Fields]:

@@ -18,12 +18,12 @@ from imutool.recording import nanoseconds, seconds
 
 Column = Float64[np.ndarray, "_"]
 Columns = Float64[np.ndarray, "_ k"]
-LEAST_COPIED = 0.9  # of the longer log's time, that two copies share
+MIN_COPIED = 0.9  # of the longer log's time, that two copies share
 SAME, DIGITS = 1e-6, 1e-7  # of a column's deviation, and of its largest value, as float32 has it
-INTERPOLATED, MOST_INTERPOLATED = 0.1, 1e-4  # of the error over twice the step; of a column's deviation
+INTERPOLATED, MAX_INTERPOLATED = 0.1, 1e-4  # of the error over twice the step; of a column's deviation
 UNLIKE_SIZE = 0.2  # of the logarithm: copies that share most of their time are no farther apart
-LEAST_INTERPOLATED = 8  # samples
-LEAST_SIZE = 1e-100  # of a constant
+MIN_INTERPOLATED = 8  # samples
+MIN_SIZE = 1e-100  # of a constant
 SHIFTS = 4  # Newton steps from a lag at first sight
 
 
@@ -46,14 +46,14 @@ def lag_at_first_sight(pair: SignalPair, settings: DiagnoseSettings) -> tuple[fl
     shared = min(t_real[-1], t_sim[-1]) - max(t_real[0], t_sim[0])
     length = min(t_real[-1] - t_real[0], t_sim[-1] - t_sim[0])
     near, chance = np.abs(lags) <= settings.alignment.farthest_s, _chance(a, b)
-    least = [float(np.clip(np.tanh(z * chance), own.least_correlation, own.most_demanded)) for z in own.alike_sigma]
-    if shared > max(own.least_s, 0.5 * length) and near.any() and np.abs(correlation[near]).max() > least[0]:
+    minimum = [float(np.clip(np.tanh(z * chance), own.min_correlation, own.max_demanded)) for z in own.alike_sigma]
+    if shared > max(own.min_s, 0.5 * length) and near.any() and np.abs(correlation[near]).max() > minimum[0]:
         return float(lags[near][np.argmax(np.abs(correlation[near]))]), None
     best = int(np.argmax(correlation))
-    if correlation[best] < least[1]:
+    if correlation[best] < minimum[1]:
         raise DataError(
             f"recording and simulation of {pair.names[0]} are not alike (correlation {correlation[best]:.2f} at best;"
-            f" two unrelated motions reach {least[1]:.2f})",
+            f" two unrelated motions reach {minimum[1]:.2f})",
             where=pair.names[0],
             expected="one motion",
             fix="Simulate what was recorded, or choose another field",
@@ -99,9 +99,9 @@ def is_copy(pair: SignalPair, settings: DiagnoseSettings) -> bool:
     No sensor reads what a simulation computes to a millionth of its motion.
     """
     sides = _sides(pair)
-    if any(len(t) < LEAST_INTERPOLATED or (np.diff(t) <= 0.0).any() for t, _ in sides):
+    if any(len(t) < MIN_INTERPOLATED or (np.diff(t) <= 0.0).any() for t, _ in sides):
         return False
-    sizes = [np.maximum(values.std(axis=0), LEAST_SIZE) for _, values in sides]
+    sizes = [np.maximum(values.std(axis=0), MIN_SIZE) for _, values in sides]
     if (np.abs(np.log(sizes[0] / sizes[1])) > UNLIKE_SIZE).any():  # saves the correlation
         return False
     try:
@@ -112,23 +112,23 @@ def is_copy(pair: SignalPair, settings: DiagnoseSettings) -> bool:
         sides = _sides(on_recorded_clock(pair, ClockDifference(shift_s, 0.0)))
     shifts = 1 if shift_s is None and not pair.clock_std_s else SHIFTS
     coarse, dense = sorted(sides, key=lambda side: -float(np.median(np.diff(side[0]))))
-    return any(_is_within(*one, *other, shifts) for one, other in ((coarse, dense), (dense, coarse)))
+    return any(_is_within(*first, *other, shifts) for first, other in ((coarse, dense), (dense, coarse)))
 
 
 def _is_within(
     t_s: Column, values: Float64[np.ndarray, "_ k"], t_other: Column, others: Float64[np.ndarray, "_ k"], shifts: int
 ) -> bool:
     """Whether values are interpolated from others, along a spline or straight lines, at some shift near zero."""
-    size, missed = np.maximum(values.std(axis=0), LEAST_SIZE), _interpolation_error(t_other, others)
-    allowed = np.maximum(SAME * size, np.minimum(missed, MOST_INTERPOLATED * size)) + DIGITS * np.abs(values).max(axis=0)
+    size, missed = np.maximum(values.std(axis=0), MIN_SIZE), _interpolation_error(t_other, others)
+    allowed = np.maximum(SAME * size, np.minimum(missed, MAX_INTERPOLATED * size)) + DIGITS * np.abs(values).max(axis=0)
     spline, lines, moved = CubicSpline(t_other, others), make_interp_spline(t_other, others, k=1), 0.0
     for _ in range(shifts):
         at = t_s + moved
         inside = (at >= t_other[0]) & (at <= t_other[-1])
-        if inside.sum() * np.ptp(t_s) / len(t_s) < LEAST_COPIED * max(np.ptp(t_s), np.ptp(t_other)):
+        if inside.sum() * np.ptp(t_s) / len(t_s) < MIN_COPIED * max(np.ptp(t_s), np.ptp(t_other)):
             return False
         each = [values[inside] - curve(at[inside]) for curve in (spline, lines)]
-        if any((np.sqrt((left**2).mean(axis=0)) <= allowed).all() for left in each):
+        if any((np.sqrt((residual**2).mean(axis=0)) <= allowed).all() for residual in each):
             return True
         slope = spline(at[inside], 1) / size
         moved += float((each[0] / size * slope).sum() / max(float((slope**2).sum()), 1e-300))
@@ -137,5 +137,5 @@ def _is_within(
 
 def _interpolation_error(t_s: Column, values: Float64[np.ndarray, "_ k"]) -> Float64[np.ndarray, " k"]:
     """Error of a cubic spline between samples: a 16th of that between every second one."""
-    left = CubicSpline(t_s[::2], values[::2])(t_s[1:-1:2]) - values[1:-1:2]
-    return np.asarray(INTERPOLATED * np.sqrt((left**2).mean(axis=0)))
+    error = CubicSpline(t_s[::2], values[::2])(t_s[1:-1:2]) - values[1:-1:2]
+    return np.asarray(INTERPOLATED * np.sqrt((error**2).mean(axis=0)))

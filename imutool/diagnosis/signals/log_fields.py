@@ -15,7 +15,7 @@ from imutool.mcap_io.fields import Fields, PlainLog, numeric_fields, others
 from imutool.mcap_io.log import Log
 from imutool.recording.columns import longest_run
 
-MOST_READ = 400  # fields of a log to compare, and as many that may drive them
+MAX_READ = 400  # fields of a log to compare, and as many that may drive them
 MAGNETIC, GNSS = "sensor_msgs/msg/MagneticField", "sensor_msgs/msg/NavSatFix"
 RANGE, TEMPERATURE = "sensor_msgs/msg/Range", "sensor_msgs/msg/Temperature"
 FIELDS_OF: Mapping[str, frozenset[str]] = {
@@ -58,7 +58,7 @@ class LogFields:
         joints = {name: lists[0] if len(lists) == 1 else [] for name, lists in named.items()}
         found: dict[str, dict[str, Fields]] = {}
         for skipped in (set(schemas) - set(compared), set(compared)):
-            for name, values in others(path, "", MOST_READ, skip=skipped | mixed, gaps=True).items():
+            for name, values in others(path, "", MAX_READ, skip=skipped | mixed, gaps=True).items():
                 topic = max((topic for topic in schemas if name.startswith(f"{topic}.")), key=len)
                 found.setdefault(topic, {})[name[len(topic) + 1 :]] = on_one_clock(values)
         return cls(schemas, {name: found[name] for name in schemas if name in found}, joints, sorted(mixed))
@@ -73,7 +73,7 @@ def read_both(real: Location, sim: Location) -> tuple[LogFields, LogFields, dict
     schemas = [_schemas(path) for path in (real, sim)]
     topics = dict(_corresponding(*schemas))
     own, other = LogFields.of(real, schemas[0], topics), LogFields.of(sim, schemas[1], set(topics.values()))
-    return own, other, {topic: theirs for topic, theirs in topics.items() if topic in own.fields and theirs in other.fields}
+    return own, other, {topic: name for topic, name in topics.items() if topic in own.fields and name in other.fields}
 
 
 def _schemas(path: Location) -> dict[str, str]:
@@ -102,13 +102,13 @@ def _corresponding(real: Mapping[str, str], sim: Mapping[str, str]) -> Iterator[
         if sim.get(topic) == schema:
             yield topic, topic
             continue
-        theirs = [name for name, other in sim.items() if other == schema and real.get(name) != schema]
-        mine = [name for name, other in real.items() if other == schema and sim.get(name) != schema]
-        moved = [name for name in theirs if name.endswith(topic) or topic.endswith(name)]
+        sim_names = [name for name, other in sim.items() if other == schema and real.get(name) != schema]
+        real_names = [name for name, other in real.items() if other == schema and sim.get(name) != schema]
+        moved = [name for name in sim_names if name.endswith(topic) or topic.endswith(name)]
         if len(moved) == 1:
             yield topic, moved[0]
-        elif len(theirs) == len(mine) == 1 and not schema.startswith("std_msgs/"):
-            yield topic, theirs[0]
+        elif len(sim_names) == len(real_names) == 1 and not schema.startswith("std_msgs/"):
+            yield topic, sim_names[0]
 
 
 def on_one_clock(values: Fields) -> Fields:

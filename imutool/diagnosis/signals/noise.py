@@ -46,7 +46,7 @@ def whitened(pair: AlignedSignal, residual: Float64[np.ndarray, "n k"], lsb: Seq
     slow, expected_slow = (values if band is None else band(values) for values in (residual, pair.sampled.x))
     top_hz = settings.signal.noise_band_end * rate_hz if pair.band_hz is None else 0.9 * pair.band_hz
     for k in range(pair.columns):
-        edge = min(_edge_hz(expected_slow[:, k], rate_hz, settings), settings.signal.most_top * top_hz)
+        edge = min(_edge_hz(expected_slow[:, k], rate_hz, settings), settings.signal.max_top * top_hz)
         f_hz, power = _density(slow[:, k], usable, rate_hz, settings.noise, "median" if band is None else "mean")
         near = (f_hz >= edge) & (f_hz <= min(2.0 * edge, top_hz))
         far = (f_hz >= edge) & (f_hz <= top_hz)
@@ -71,7 +71,7 @@ def _edge_hz(x: Column, rate_hz: float, settings: DiagnoseSettings) -> float:
     f_hz, power = welch(x, rate_hz, nperseg=min(settings.noise.segment_samples, len(x)))
     share = np.cumsum(power) / max(float(power.sum()), 1e-300)
     edge_hz = own.edge_factor * f_hz[np.searchsorted(share, own.power_share)]
-    return float(np.clip(edge_hz, own.least_edge * rate_hz, own.most_edge * rate_hz))
+    return float(np.clip(edge_hz, own.min_edge * rate_hz, own.max_edge * rate_hz))
 
 
 def _density(
@@ -107,8 +107,8 @@ def rich_residual(pair: AlignedSignal, column: int) -> Float64[np.ndarray, " n"]
     usable = pair.usable[:, 0]
     columns = columns[: int(usable.sum()) // RICH_SAMPLES]  # of few samples a rich fit would leave nothing
     taken = len(columns) / max(int(usable.sum()), 1)  # of the noise, by the fit
-    left = pair.real[:, column] - ridge_fit(np.stack(columns, axis=1), pair.real[:, column], usable)
-    return np.asarray(left / np.sqrt(1.0 - taken))
+    residual = pair.real[:, column] - ridge_fit(np.stack(columns, axis=1), pair.real[:, column], usable)
+    return np.asarray(residual / np.sqrt(1.0 - taken))
 
 
 def lsb_of(pair: SignalPair, settings: DiagnoseSettings) -> list[float]:
@@ -183,7 +183,7 @@ def with_learnt_error(finding: Finding, effect: Effect, errors: Mapping[str, Flo
     """Finding with no parameter surer than the dynamics that were learnt; a curve has none."""
     by_name = {parameter.name: error for parameter, error in zip(effect.parameters, errors[effect.key].tolist(), strict=True)}
     parameters = {
-        name: msgspec.structs.replace(one, std=float(np.linalg.norm([one.std, by_name[name], LEARNT_ERROR * one.value])))
-        for name, one in finding.parameters.items()
+        name: msgspec.structs.replace(e, std=float(np.linalg.norm([e.std, by_name[name], LEARNT_ERROR * e.value])))
+        for name, e in finding.parameters.items()
     }
     return msgspec.structs.replace(finding, parameters=parameters)

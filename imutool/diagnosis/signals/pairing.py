@@ -27,7 +27,7 @@ from imutool.mcap_io.fields import Fields
 from imutool.sensor.channels import is_quantity
 from imutool.units import AXES
 
-MOST_COMPARED, MOST_DRIVERS = 24, 6
+MAX_COMPARED, MAX_DRIVERS = 24, 6
 LISTED = 12
 VALUES: Mapping[str, tuple[str, str, str]] = {
     PRESSURE: ("fluid_pressure", "pressure", "Pa"),
@@ -63,8 +63,8 @@ def paired(real: Location, sim: Location, clock: ClockDifference | None = None) 
     wheels = _wheels(own, other, topics)
     fields = dict(_of_three_topics(own, other, topics))
     parts = {topic for three in fields for topic in three}
-    alone = ((topic, theirs) for topic, theirs in topics.items() if topic not in parts)
-    found = chain(fields.values(), *(_of_topic(own, other, topic, theirs, wheels) for topic, theirs in alone))
+    alone = ((topic, sim_topic) for topic, sim_topic in topics.items() if topic not in parts)
+    found = chain(fields.values(), *(_of_topic(own, other, topic, sim_topic, wheels) for topic, sim_topic in alone))
     for given in (on_recorded_clock(pair, clock) for pair in found):
         if is_copy(given, DiagnoseSettings()):
             same.extend(given.names)
@@ -74,11 +74,11 @@ def paired(real: Location, sim: Location, clock: ClockDifference | None = None) 
                 remarks += [remark] if remark else []
             pairs.append(given)
     pairs.sort(key=lambda pair: pair.kind == "number")  # a sort keeps the log's order otherwise
-    untried = [name for pair in pairs[MOST_COMPARED:] for name in pair.names]
-    pairs = pairs[:MOST_COMPARED]
+    untried = [name for pair in pairs[MAX_COMPARED:] for name in pair.names]
+    pairs = pairs[:MAX_COMPARED]
     rate_of = _listed("The rates of recorded positions, which are compared", _rates(own, other, topics, pairs))
     remarks += (
-        rate_of + _listed("The same in both logs", same) + _listed(f"Not compared, for at most {MOST_COMPARED} are", untried)
+        rate_of + _listed("The same in both logs", same) + _listed(f"Not compared, for at most {MAX_COMPARED} are", untried)
     )
     return Pairing(tuple(pairs), _drivers(own, pairs, parts), tuple(remarks))
 
@@ -99,50 +99,50 @@ def _rates(real: LogFields, sim: LogFields, topics: Mapping[str, str], pairs: Se
 def _wheels(real: LogFields, sim: LogFields, topics: Mapping[str, str]) -> dict[str, tuple[SignalPair, list[str]]]:
     """Vehicles by topic, each with the joints that drive it: those of the first topic that has some."""
     out = dict[str, tuple[SignalPair, list[str]]]()
-    joints = [_joints(real, sim, topic, theirs) for topic, theirs in topics.items() if real.schemas[topic] == JOINTS]
-    for topic, theirs in topics.items():
+    joints = [_joints(real, sim, topic, sim_topic) for topic, sim_topic in topics.items() if real.schemas[topic] == JOINTS]
+    for topic, sim_topic in topics.items():
         if real.schemas[topic] == ODOMETRY:
-            found = (wheel_pair(topic, real.fields[topic], sim.fields[theirs], both) for both in joints)
+            found = (wheel_pair(topic, real.fields[topic], sim.fields[sim_topic], both) for both in joints)
             if (first := next((pair for pair in found if pair is not None), None)) is not None:
                 out[topic] = first
     return out
 
 
-def _joints(real: LogFields, sim: LogFields, topic: str, theirs: str) -> tuple[Mapping[str, Fields], Mapping[str, Fields]]:
+def _joints(real: LogFields, sim: LogFields, topic: str, sim_topic: str) -> tuple[Mapping[str, Fields], Mapping[str, Fields]]:
     """Fields of both logs under the recording's indices of joints."""
-    return real.fields[topic], by_joint(sim.fields[theirs], real.joints[topic], sim.joints[theirs])
+    return real.fields[topic], by_joint(sim.fields[sim_topic], real.joints[topic], sim.joints[sim_topic])
 
 
 def _of_topic(
-    real: LogFields, sim: LogFields, topic: str, theirs: str, wheels: Mapping[str, tuple[SignalPair, list[str]]]
+    real: LogFields, sim: LogFields, topic: str, sim_topic: str, wheels: Mapping[str, tuple[SignalPair, list[str]]]
 ) -> Iterator[SignalPair]:
     """Signals of one topic."""
-    mine, other, schema = real.fields[topic], sim.fields[theirs], real.schemas[topic]
+    own_fields, other, schema = real.fields[topic], sim.fields[sim_topic], real.schemas[topic]
     if schema == JOINTS:  # the wheels are given, as the motion of an arm is
         used = {k for _, indices in wheels.values() for k in indices}
-        yield from joint_pairs(topic, *_joints(real, sim, topic, theirs), used)
+        yield from joint_pairs(topic, *_joints(real, sim, topic, sim_topic), used)
         return
     done: tuple[str, ...] = SPEEDS if topic in wheels else ()
     if topic in wheels:
         yield wheels[topic][0]
     if schema in TRIPLES:
         done, kind, unit = TRIPLES[schema]
-        if all(path in side for path in done for side in (mine, other)):
-            sides = (metres(mine, other), metres(other, other)) if kind == "gnss" else (mine, other)
+        if all(path in side for path in done for side in (own_fields, other)):
+            sides = (metres(own_fields, other), metres(other, other)) if kind == "gnss" else (own_fields, other)
             yield SignalPair.of_columns(topic, done, kind, (unit,) * 3, *sides, _attitude(real))
     else:
-        for names in field_vectors(topic, mine, other):
+        for names in field_vectors(topic, own_fields, other):
             done = (*done, *names)
-            yield SignalPair.of_columns(topic, names, "magnetic", ("",) * 3, mine, other, _attitude(real))
-    for path in mine:
+            yield SignalPair.of_columns(topic, names, "magnetic", ("",) * 3, own_fields, other, _attitude(real))
+    for path in own_fields:
         if path in other and path not in done and not (schema == ODOMETRY and path.startswith("pose.")):
             value, kind, unit = VALUES.get(schema, ("", "", ""))
             kind, unit = (kind, unit) if path == value else ("number", _unit(path))
-            if all(is_air(f"{topic}.{path}", side[path]) for side in (mine, other)):
+            if all(is_air(f"{topic}.{path}", side[path]) for side in (own_fields, other)):
                 kind = "pressure"
             state = _speed(real) if kind == "pressure" else {}
-            pair = replace(SignalPair.of_fields(mine[path], other[path], f"{topic}.{path}"), kind=kind, state=state)
-            if is_quantity(mine[path]):
+            pair = replace(SignalPair.of_fields(own_fields[path], other[path], f"{topic}.{path}"), kind=kind, state=state)
+            if is_quantity(own_fields[path]):
                 yield replace(unwrapped(pair), units=(pair.units[0] or unit,))
 
 
@@ -150,15 +150,15 @@ def _of_three_topics(
     real: LogFields, sim: LogFields, topics: Mapping[str, str]
 ) -> Iterator[tuple[tuple[str, ...], SignalPair]]:
     """Magnetic fields whose x, y and z are topics of their own, with these topics."""
-    shared = [topic for topic, theirs in topics.items() if NUMBER in real.fields[topic] and NUMBER in sim.fields[theirs]]
-    mine, other = (
+    shared = [topic for topic, sim_topic in topics.items() if NUMBER in real.fields[topic] and NUMBER in sim.fields[sim_topic]]
+    own_fields, other = (
         {topic: side.fields[of][NUMBER] for topic, of in zip(shared, names, strict=True)}
         for side, names in ((real, shared), (sim, [topics[topic] for topic in shared]))
     )
-    for names in field_vectors("", mine, other):
+    for names in field_vectors("", own_fields, other):
         k = next(k for k, letters in enumerate(zip(*names, strict=True)) if len(set(letters)) > 1)
         name = f"{names[0][:k]}xyz{names[0][k + 1 :]}"
-        pair = SignalPair.of_columns(name, names, "magnetic", ("",) * 3, mine, other, _attitude(real))
+        pair = SignalPair.of_columns(name, names, "magnetic", ("",) * 3, own_fields, other, _attitude(real))
         yield names, replace(pair, names=tuple(f"{name}.{axis}" for axis in AXES))
 
 
@@ -171,13 +171,15 @@ def _remarks(real: LogFields, sim: LogFields, topics: Mapping[str, str]) -> list
     mixed = sorted({*real.mixed, *sim.mixed})
     out = _listed("Not compared, for its messages name now these joints and now those", mixed)
     alone, gaps = list[str](), list[str]()
-    for topic, theirs in topics.items():
-        mine, other = real.fields[topic], sim.fields[theirs]
+    for topic, sim_topic in topics.items():
+        own_fields, other = real.fields[topic], sim.fields[sim_topic]
         if real.schemas[topic] == JOINTS:
-            other = by_joint(other, real.joints[topic], sim.joints[theirs])
-            out += joint_remarks(topic, real.joints[topic], sim.joints[theirs])
-        gaps += [f"{values.left_out} of {topic}.{path}" for path, values in mine.items() if path in other and values.left_out]
-        alone += [f"{topic}.{path}" for path in other if path not in mine and is_quantity(other[path])]
+            other = by_joint(other, real.joints[topic], sim.joints[sim_topic])
+            out += joint_remarks(topic, real.joints[topic], sim.joints[sim_topic])
+        gaps += [
+            f"{values.left_out} of {topic}.{path}" for path, values in own_fields.items() if path in other and values.left_out
+        ]
+        alone += [f"{topic}.{path}" for path in other if path not in own_fields and is_quantity(other[path])]
     out += _listed("Rows of the recording without a number or with a repeated stamp were left out", gaps)
     return out + _listed("Constant, empty or missing in the recording, while the simulation has it", alone)
 
@@ -225,4 +227,4 @@ def _drivers(side: LogFields, pairs: Sequence[SignalPair], parts: Set[str]) -> d
         and (path == VALUES.get(side.schemas[topic], (path,))[0])
     }
     temperatures_first = sorted(found, key=lambda name: ("temperature" not in name.lower(), name in compared))
-    return {name: found[name] for name in temperatures_first[:MOST_DRIVERS]}
+    return {name: found[name] for name in temperatures_first[:MAX_DRIVERS]}

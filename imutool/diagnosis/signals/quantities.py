@@ -47,8 +47,8 @@ def field_vectors(topic: str, real: Mapping[str, Fields], sim: Mapping[str, Fiel
             triple = tuple(f"{path[: first.start()]}{axis}{path[first.end() :]}" for axis in axes[:3])
             named = MAGNETIC.search(f"{topic}.{path}".lower()) is not None
             named &= f"{path[: first.start()]}{axes[3]}{path[first.end() :]}" not in real
-            if named and all(one in side and is_quantity(side[one]) for one in triple for side in (real, sim)):
-                columns = (stacked([side[one] for one in triple])[1] for side in (real, sim))
+            if named and all(field in side and is_quantity(side[field]) for field in triple for side in (real, sim)):
+                columns = (stacked([side[field] for field in triple])[1] for side in (real, sim))
                 if None not in [_unit("magnetic", values) for values in columns]:
                     yield triple
 
@@ -60,15 +60,15 @@ def is_air(name: str, values: Fields) -> bool:
 
 def _unit(kind: str, values: Float64[np.ndarray, "n k"]) -> str | None:
     """Unit in which values have the size that there is on the Earth; None where they have it in no unit."""
-    size, (least, most) = float(np.median(np.linalg.norm(values, axis=1))), SIZES[kind]
-    within = {unit: size * factor for unit, factor in UNITS[kind].items() if least < size * factor < most}
+    size, (minimum, maximum) = float(np.median(np.linalg.norm(values, axis=1))), SIZES[kind]
+    within = {unit: size * factor for unit, factor in UNITS[kind].items() if minimum < size * factor < maximum}
     return min(within, key=lambda unit: _departure(kind, within[unit]), default=None)
 
 
 def _departure(kind: str, size: float) -> float:
     """Departure (logarithm) of a size in T or Pa from the middle of those on Earth."""
-    least, most = SIZES[kind]
-    return abs(float(np.log(size / np.sqrt(least * most))))
+    minimum, maximum = SIZES[kind]
+    return abs(float(np.log(size / np.sqrt(minimum * maximum))))
 
 
 def in_si(pair: SignalPair) -> tuple[SignalPair, str]:
@@ -80,8 +80,8 @@ def in_si(pair: SignalPair) -> tuple[SignalPair, str]:
         return pair, ""
     (si, *_), (real, sim) = UNITS[pair.kind], (UNITS[pair.kind][str(unit)] for unit in units)
     changed = replace(pair, real=real * pair.real, sim=sim * pair.sim, units=(si,) * len(pair.units))
-    said = " and ".join(dict.fromkeys(str(unit) for unit in units))
-    return changed, "" if said == si else f"{pair.name} was converted to {si}: its size shows that it is in {said}"
+    names = " and ".join(dict.fromkeys(str(unit) for unit in units))
+    return changed, "" if names == si else f"{pair.name} was converted to {si}: its size shows that it is in {names}"
 
 
 def unwrapped(pair: SignalPair) -> SignalPair:

@@ -29,7 +29,7 @@ REACHED = (0.001, 0.02, 0.1)  # of the samples beyond a limit to start from
 STEEP = 0.002  # of the signal's size, over which a jump is smeared
 MOVED = 0.005  # of the signal's size, by which derivatives move it: more than a jump's width, or they see none or all of it
 LOG_MOVED = 0.02  # of the logarithm of a positive parameter, likewise
-LEAST_LAG_S = 0.02  # at first sight, which is two samples of the clock on which it is seen
+MIN_LAG_S = 0.02  # at first sight, which is two samples of the clock on which it is seen
 VECTORS = {"magnetic"}  # kinds whose columns are a vector: what drives it has a field of its own
 KNOTS, KNOTS_OF_TIME = 7, 15
 BEND = 0.3  # of the signal's size: a second difference between a curve's knots
@@ -106,7 +106,7 @@ def named(signal: AlignedSignal) -> Iterator[Effect]:
 
 def _of_lag(lag_s: float) -> list[float]:
     """Cut-off (rad/s) of a first-order lag that delays what is slow so much."""
-    return [1.0 / lag_s] if lag_s > LEAST_LAG_S else []
+    return [1.0 / lag_s] if lag_s > MIN_LAG_S else []
 
 
 def _low_pass(ideal: IdealSignal, theta: Theta) -> IdealSignal:
@@ -153,8 +153,8 @@ def _limits(real: Samples, size: float, unit: str) -> Iterator[Effect]:
 
     def effect(variant: str, text: str, numbers: tuple[Parameter, ...], starts: list[Theta]) -> Effect:
         def clip(s: SignalSamples, theta: Theta) -> SignalSamples:
-            least, most = theta[-1] if lower in numbers else -np.inf, theta[0] if upper in numbers else np.inf
-            return s.but(np.clip(s.y, least, most))
+            minimum, maximum = theta[-1] if lower in numbers else -np.inf, theta[0] if upper in numbers else np.inf
+            return s.but(np.clip(s.y, minimum, maximum))
 
         return _effect("saturation", Stage.CONVERTER, text, numbers, clip, starts, variant=variant)
 

@@ -49,17 +49,17 @@ def torque_constants(log: WhitenedLog, candidates: Sequence[Effect], always: Cho
     gains = [effect for effect in candidates if effect.name == GAIN]
     if not gains or not _far(first := _at_first_sight(signal)):
         return None
-    currents = (*always, *((effect, np.array([one])) for effect, one in zip(gains, first.values(), strict=True)))
+    currents = (*always, *((effect, np.array([gain])) for effect, gain in zip(gains, first.values(), strict=True)))
     torques, limited = (*always, *((effect, np.ones(1)) for effect in gains)), fit([log], always)
     far = _far(first).keys()
     for limit in (effect for effect in candidates if effect.name == LIMIT and far & {*(effect.sensors or signal.names)}):
         limited = min((fit([log], (*limited.chosen, (limit, start))) for start in signal.starts(limit)), key=bic)
     loads = [(load, start) for load in candidates if load.name == LOAD for start in signal.starts(load)]
-    one = signal.columns == 1  # whose load is a gain and a rotor
-    beside = (limited.chosen,) if one else (currents, torques, limited.chosen)
+    gain = signal.columns == 1  # whose load is a gain and a rotor
+    beside = (limited.chosen,) if gain else (currents, torques, limited.chosen)
     late = [(delay, start) for delay in candidates if delay.name == DELAY for start in signal.starts(delay)]
     trials = [fit([log], currents), limited, *(fit([log], (*base, load)) for base in beside for load in loads)]
-    trials += [fit([log], (*base, one)) for base in (currents, torques) for one in late]
+    trials += [fit([log], (*base, gain)) for base in (currents, torques) for gain in late]
     best = {effect.key: float(theta[0]) for effect, theta in min(trials, key=bic).chosen}
     constants = {name: best.get(effect.key, 1.0) for name, effect in zip(first, gains, strict=True)}
     return np.array(list(constants.values())) if _far(constants) else None
@@ -123,8 +123,8 @@ def _at_first_sight(signal: AlignedSignal) -> dict[str, float]:
         weight = np.ones(len(efforts))
         for _ in range(REWEIGHTED):
             shares = np.linalg.lstsq(columns * weight[:, None], efforts * weight, rcond=None)[0]
-            left = np.abs(efforts - columns @ shares)
-            weight = 1.0 / np.sqrt(np.maximum(left, SMALL_LEFT * float(left.mean()) + 1e-300))
+            residual = np.abs(efforts - columns @ shares)
+            weight = 1.0 / np.sqrt(np.maximum(residual, SMALL_LEFT * float(residual.mean()) + 1e-300))
         out[name] = length / float(shares[0]) if shares[0] else 1.0
     return out
 

@@ -101,24 +101,24 @@ def diagnose_signal(
         DataError: constant, too short, or not of one motion; the message says what to do.
     """
     signal, selection = _with_own_search(aligned(pair, others, settings or DiagnoseSettings())), None
-    now = _Prepared.of(signal, pair)
-    constants = torque_constants(now.log, now.candidates, now.always)
+    prepared = _Prepared.of(signal, pair)
+    constants = torque_constants(prepared.log, prepared.candidates, prepared.always)
     for _ in range(CONVERTED):
         if constants is None:
             break
         signal, pair = as_torques(signal, constants), replace(pair, real=constants * pair.real)
-        now = _Prepared.of(signal, pair)
-        selection = _selected(now)
+        prepared = _Prepared.of(signal, pair)
+        selection = _selected(prepared)
         constants = gains_of(selection)
-    selection = selection or _selected(now)
+    selection = selection or _selected(prepared)
     if (settled := signal.settled(selection.whole.chosen)) is not signal:
-        signal, now = settled, _Prepared.of(settled, pair)
-        selection = _selected(now)
-    rewhitened = whitened(signal, signal.real - expected(signal, selection.whole.chosen), now.lsb)
-    if (noise_std(rewhitened.whiten) < signal.settings.signal.better_noise * noise_std(now.log.whiten)).any():
-        now = now._replace(log=rewhitened)  # the effects' own high frequencies were taken for noise
-        selection = _selected(now)
-    return _summarized(now.log, now.candidates, selection, now.lsb, signal.settings)
+        signal, prepared = settled, _Prepared.of(settled, pair)
+        selection = _selected(prepared)
+    rewhitened = whitened(signal, signal.real - expected(signal, selection.whole.chosen), prepared.lsb)
+    if (noise_std(rewhitened.whiten) < signal.settings.signal.better_noise * noise_std(prepared.log.whiten)).any():
+        prepared = prepared._replace(log=rewhitened)  # the effects' own high frequencies were taken for noise
+        selection = _selected(prepared)
+    return _summarized(prepared.log, prepared.candidates, selection, prepared.lsb, signal.settings)
 
 
 class _Prepared(NamedTuple):
@@ -149,9 +149,9 @@ class _Prepared(NamedTuple):
 def _with_own_search(signal: AlignedSignal) -> AlignedSignal:
     """Signal whose search is for effects of each column, but for those that `above_model_error` would leave out."""
     search = signal.settings.search
-    most = max(search.most_effects, search.effects_each_column * signal.columns)
-    least = max(search.negligible_share, 0.0 if signal.band_hz is None else SMALL_GAIN)
-    search = msgspec.structs.replace(search, most_effects=most, negligible_share=least)
+    maximum = max(search.max_effects, search.effects_each_column * signal.columns)
+    minimum = max(search.negligible_share, 0.0 if signal.band_hz is None else SMALL_GAIN)
+    search = msgspec.structs.replace(search, max_effects=maximum, negligible_share=minimum)
     return replace(signal, settings=msgspec.structs.replace(signal.settings, search=search))
 
 
@@ -161,31 +161,31 @@ def _refined(log: WhitenedLog, selection: Selection, settings: DiagnoseSettings)
     if all(finer[effect.key] is effect for effect, _ in selection.whole.chosen):
         return selection
     chosen = [
-        tuple((of := finer[effect.key], np.append(theta, of.null_value[len(theta) :])) for effect, theta in one.chosen)
-        for one in (selection.fitted, selection.whole)
+        tuple((of := finer[effect.key], np.append(theta, of.null_value[len(theta) :])) for effect, theta in s.chosen)
+        for s in (selection.fitted, selection.whole)
     ]
     fitted, whole = fit([log], chosen[0]), fit([log], chosen[1], part="all")
     stds = scatter([log], whole, "all", settings.search.robust_block_s).std
     effects = {effect.key: (effect, theta) for effect, theta in whole.chosen}
     selected = [
-        replace(one, effect=effects[one.effect.key][0], theta=effects[one.effect.key][1], std=stds[one.effect.key])
-        for one in selection.selected
+        replace(s, effect=effects[s.effect.key][0], theta=effects[s.effect.key][1], std=stds[s.effect.key])
+        for s in selection.selected
     ]
     return replace(selection, selected=tuple(selected), fitted=fitted, whole=whole)
 
 
-def _selected(now: _Prepared) -> Selection:
+def _selected(prepared: _Prepared) -> Selection:
     """Effects of the catalogue, channels that drive and terms of equations; a curve where none of them stands out."""
-    log, candidates, always = now.log, now.candidates, now.always
+    log, candidates, always = prepared.log, prepared.candidates, prepared.always
     signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     columns = range(signal.columns)
     driven = [*common.driven(signal)]
     named = _refined(log, select_effects([log], candidates, [driven], always=always), signal.settings)
-    if (resting := _beside_stiction(now, named, driven)) is not None:
+    if (resting := _beside_stiction(prepared, named, driven)) is not None:
         named, candidates = resting
-    left, largest = named.whole.objective - named.whole.numbers, max((one.gain for one in named.selected), default=0.0)
+    remaining, largest = named.whole.objective - named.whole.numbers, max((e.gain for e in named.selected), default=0.0)
     settings = signal.settings.search
-    if named.whole.reduced_chi_square < settings.explained_chi_square or left < settings.negligible_share * largest:
+    if named.whole.reduced_chi_square < settings.explained_chi_square or remaining < settings.negligible_share * largest:
         return named  # a term may fit as well as a name, and says less
     equations = [effect for k in columns for effect in terms(signal, k)]
     selection = _refined(log, select_effects([log], candidates, [driven, equations], always=always), signal.settings)
@@ -198,19 +198,19 @@ def _selected(now: _Prepared) -> Selection:
     return curved if gain > CURVE_SHARE * (before - selection.whole.objective) else selection
 
 
-def _beside_stiction(now: _Prepared, found: Selection, driven: Sequence[Effect]) -> tuple[Selection, list[Effect]] | None:
+def _beside_stiction(prepared: _Prepared, found: Selection, driven: Sequence[Effect]) -> tuple[Selection, list[Effect]] | None:
     """Selection beside joints that friction holds at rest, and its candidates; None where it is no better.
 
     What a joint's rest leaves looks like a delay, for the joint turns when its effort does not.
     """
-    settings = now.log.pair.settings
+    settings = prepared.log.pair.settings
     begin = tuple(entry for entry in found.whole.chosen if holds(entry[0]))
     if not begin or found.whole.reduced_chi_square < settings.search.explained_chi_square:
         return None
     joints = {effect.sensors for effect, _ in begin}
-    candidates = [with_stiction(effect) if effect.sensors in joints else effect for effect in now.candidates]
-    trial = select_effects([now.log], candidates, [driven], always=now.always, begin=begin)
-    trial = _refined(now.log, trial, settings)
+    candidates = [with_stiction(effect) if effect.sensors in joints else effect for effect in prepared.candidates]
+    trial = select_effects([prepared.log], candidates, [driven], always=prepared.always, begin=begin)
+    trial = _refined(prepared.log, trial, settings)
     return (trial, candidates) if bic(trial.whole) < bic(found.whole) - settings.search.clearly_better else None
 
 
@@ -241,7 +241,7 @@ def _summarized(
     place = partial(locate_findings, [pair], [before], [after], level, (), p_values, settings.localization)
     floor = level.copy()
     for k in range(pair.columns):
-        if lsb[k] > settings.timestamps.least_digits * float(level[k]):
+        if lsb[k] > settings.timestamps.min_digits * float(level[k]):
             finding, rounded = digits(log, after, k, lsb[k])
             after = rounded if finding.held_out.rms_after < finding.held_out.rms_before else after
             findings.append(finding)
@@ -253,8 +253,8 @@ def _summarized(
             level, MODEL_ERROR * np.array([held_out_rms(logs, [before], [before], n).rms_before for n in names])
         )
     unexplained = unexplained_residuals(logs, [after], floor, settings.held_out)
-    most = settings.held_out.most_white_ratio
-    beyond = any(not left.white and left.rms > most * left.noise_floor for left in unexplained.values())
+    maximum = settings.held_out.max_white_ratio
+    beyond = any(not residual.white and residual.rms > maximum * residual.noise_floor for residual in unexplained.values())
     gains = {f.signal: f.parameters["gain"].value for f in findings if f.effect == "actuator_gain"}
     hidden = () if pair.shares_epoch else tuple(f"{name}.delay" for name in names)
     unseen = [*small, *(_unseen(log, candidates, selection, settings) if pair.columns > 1 else ())]

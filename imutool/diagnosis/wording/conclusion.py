@@ -49,8 +49,8 @@ def headline(d: Diagnosis) -> str:
         parts.append(unnamed)
     elif all(_residual(d, signal) == QUIET for signal in d.unexplained):
         parts.append(QUIET)
-    elif left := [signal for signal, residual in d.unexplained.items() if not residual.white and not _rings(d, signal)]:
-        parts.append(f"{_the(' and '.join(left))} {'keep' if len(left) > 1 else 'keeps'} a misfit that has no name")
+    elif signals := [signal for signal, residual in d.unexplained.items() if not residual.white and not _rings(d, signal)]:
+        parts.append(f"{_the(' and '.join(signals))} {'keep' if len(signals) > 1 else 'keeps'} a misfit that has no name")
     elif not any(_rings(d, signal) for signal in d.unexplained):
         parts.append("what is left may be noise")
     if d.caveat:

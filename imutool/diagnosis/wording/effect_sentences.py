@@ -113,8 +113,8 @@ def _convention(finding: Finding) -> str:
     c = finding.parameters.get("c")
     if c is None or finding.equation != f"{finding.signal}.{finding.axis} += c {own}_{finding.axis}":
         return ""
-    told = (text for (signal, gain), text in CONVENTIONS.items() if signal == finding.signal and _near(1.0 + c.value, gain))
-    return next(told, "")
+    texts = (text for (signal, gain), text in CONVENTIONS.items() if signal == finding.signal and _near(1.0 + c.value, gain))
+    return next(texts, "")
 
 
 def _near(gain: float, other: float) -> bool:

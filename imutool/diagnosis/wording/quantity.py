@@ -42,8 +42,8 @@ class Quantity:
             return value(self.estimates[0])
         if self.axes[0].startswith("at "):
             sure = [e for e in self.estimates if e.std <= VAGUE * min(other.std for other in self.estimates)]
-            least, most = (value(extreme(sure, key=lambda e: e.value)) for extreme in (min, max))
-            return f"{least} to {most}"
+            minimum, maximum = (value(extreme(sure, key=lambda e: e.value)) for extreme in (min, max))
+            return f"{minimum} to {maximum}"
         if self.axes == AXES:
             return vector(self.estimates)
         clearest = sorted(range(len(self.axes)), key=lambda k: -_clearness(self.estimates[k]))[:SHOWN]
@@ -76,8 +76,8 @@ def stated_parameters(finding: Finding) -> Mapping[str, Estimate]:
     tau = finding.parameters.get("tau") if finding.effect in DRIFTS else None
     if tau is None or tau.std <= tau.value:
         return finding.parameters
-    amplitudes = {key: one for key, one in finding.parameters.items() if key != "tau"}
-    return {key: Estimate(one.value / tau.value, one.std / tau.value, RATES[one.unit]) for key, one in amplitudes.items()}
+    amplitudes = {key: a for key, a in finding.parameters.items() if key != "tau"}
+    return {key: Estimate(a.value / tau.value, a.std / tau.value, RATES[a.unit]) for key, a in amplitudes.items()}
 
 
 def grouped(estimates: Mapping[str, Estimate]) -> list[Quantity]:
@@ -175,8 +175,8 @@ def _step(several: Sequence[Estimate]) -> tuple[float, str]:
         largest = max((estimate.std for estimate in several if math.isfinite(estimate.std)), default=0.0)
     if largest == 0.0:  # a form, such as an order
         return 1.0, unit
-    for least, size, name in STEPS.get(unit or "-", ()):
-        if largest >= least:
+    for minimum, size, name in STEPS.get(unit or "-", ()):
+        if largest >= minimum:
             return size, name
     return 1.0, unit
 

@@ -12,7 +12,7 @@ from imutool.inertial.scoring.path_blocks import WindowPiece
 from imutool.recording import Poses, seconds
 from imutool.recording.columns import median
 
-FEWEST_WINDOWS, MOST_MISSED = 10, 4.0  # that show a delay of the poses; of the median error of windows, that of one that counts
+FEWEST_WINDOWS, MAX_MISSED = 10, 4.0  # that show a delay of the poses; of the median error of windows, that of one that counts
 Vectors = Float64[np.ndarray, "m 3"]
 
 
@@ -28,7 +28,7 @@ def pose_delay(pieces: Iterable[WindowPiece]) -> tuple[float, float] | None:
         return None
     error, miss = (np.concatenate(column) for column in zip(*found, strict=True))
     size = quaternion.length(error)
-    kept = size <= MOST_MISSED * median(size)
+    kept = size <= MAX_MISSED * median(size)
     error, miss = error[kept], miss[kept]
     power = max(float((miss**2).sum()), np.finfo(np.float64).tiny)
     delay_s = float((miss * error).sum()) / power

@@ -195,8 +195,8 @@ def as_ros1(rows: UInt8[np.ndarray, "n L"], schema_name: str) -> UInt8[np.ndarra
     source = layout_of(schema_name, "cdr", message=rows[0].tobytes())
     target = layout_of(schema_name, "ros1", texts=list(source.texts))
     made = _blank(len(rows), target)
-    for (ours, size), (theirs, _) in zip(_places(target), _places(source), strict=True):
-        made[:, ours : ours + size] = rows[:, theirs : theirs + size]
+    for (ours, size), (source_place, _) in zip(_places(target), _places(source), strict=True):
+        made[:, ours : ours + size] = rows[:, source_place : source_place + size]
     return made
 
 

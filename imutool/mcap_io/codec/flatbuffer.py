@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from imutool.mcap_io.codec.formats import DEPTH, LACKS, MAX_ROW, MOST_FIELDS, Path, fields_of, nested
+from imutool.mcap_io.codec.formats import DEPTH, LACKS, MAX_FIELDS, MAX_ROW, Path, fields_of, nested
 
 # Base types of reflection.fbs with a fixed size, and the kinds that refer to others.
 SCALARS = dict(zip(range(3, 13), "bBhHiIqQfd", strict=True))
@@ -65,18 +65,18 @@ class FlatBuffer:
 
     def tree(self, depth: int) -> dict[str, Any]:
         """Tree of the fields, as `reflection` has it."""
-        return self._tree(self._root, depth, [MOST_FIELDS])
+        return self._tree(self._root, depth, [MAX_FIELDS])
 
-    def _tree(self, kind: Object, depth: int, left: list[int]) -> dict[str, Any]:
+    def _tree(self, kind: Object, depth: int, budget: list[int]) -> dict[str, Any]:
         fields: dict[str, Any] = {}
         for name, field in kind.fields.items():
-            left[0] -= 1
-            if left[0] < 0:
+            budget[0] -= 1
+            if budget[0] < 0:
                 break
             if field.base in SCALARS:
                 fields[name] = "number" if field.index < 0 else ""  # else of an enum
             elif field.base == OBJECT:
-                fields[name] = self._tree(self._objects[field.index], depth - 1, left) if depth else ""
+                fields[name] = self._tree(self._objects[field.index], depth - 1, budget) if depth else ""
             elif field.base in (VECTOR, ARRAY) and field.element in SCALARS:
                 fields[name] = "matrix" if "covariance" in name.lower() else "vector"
             else:
@@ -262,7 +262,7 @@ class _Table:
         """Tables of a vector."""
         if place := self.place(4 + 2 * identity):
             first, count = _vector(self.raw, place)
-            if count > MOST_FIELDS:
+            if count > MAX_FIELDS:
                 raise ValueError(f"a vector of {count} tables")
             for number in range(count):
                 yield _Table(self.raw, _offset(self.raw, first + 4 * number))

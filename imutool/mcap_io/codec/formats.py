@@ -16,7 +16,7 @@ COUNTED = {rf"{CLOCK}_?ns(ec)?": 1, rf"{CLOCK}_?us(ec)?|utime": 1000}  # stamps 
 SECONDS, NANOSECONDS = ("sec", "seconds", "secs"), ("nsec", "nanos", "nanosec", "nsecs", "nanoseconds")
 DEPTH = 4  # messages within messages that are searched
 MAX_ROW = 64  # numbers of a list that are fields of their own
-DEEPEST, MOST_FIELDS = 24, 5000  # of a message's numbers: messages within messages, and fields; one can nest without end
+DEEPEST, MAX_FIELDS = 24, 5000  # of a message's numbers: messages within messages, and fields; one can nest without end
 NUMBER, VECTOR, MATRIX, TEXT = "number", "vector", "matrix", "text"
 Path = tuple[str | int, ...]  # of a field; a number of a list has its place at the end
 Tree = Mapping[str, Any]  # of fields: NUMBER, VECTOR, MATRIX, TEXT or a tree
@@ -94,8 +94,8 @@ class Json:
         for key in path:
             inner = node.get("properties") if isinstance(node, dict) else None
             node = inner.get(key) if isinstance(inner, dict) else None
-            said = [node.get(name, "") for name in ("unit", "units", "description", "title")] if isinstance(node, dict) else []
-            found.append(next((text for text in said if isinstance(text, str) and text), ""))
+            texts = [node.get(name, "") for name in ("unit", "units", "description", "title")] if isinstance(node, dict) else []
+            found.append(next((text for text in texts if isinstance(text, str) and text), ""))
         yield from reversed(found)
 
     def parse(self, raw: bytes) -> Any:
@@ -132,7 +132,7 @@ class Json:
 
     def numbers(self, message: Any) -> Iterator[Path]:
         """Paths of all numbers in a message."""
-        yield from islice(_numbers(message, ()), MOST_FIELDS)
+        yield from islice(_numbers(message, ()), MAX_FIELDS)
 
 
 def _numbers(value: Any, path: Path) -> Iterator[Path]:

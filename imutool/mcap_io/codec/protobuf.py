@@ -10,7 +10,7 @@ from typing import Any
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 
-from imutool.mcap_io.codec.formats import DEEPEST, MAX_ROW, MOST_FIELDS, Path
+from imutool.mcap_io.codec.formats import DEEPEST, MAX_FIELDS, MAX_ROW, Path
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Protobuf:
 
     def tree(self, depth: int) -> dict[str, Any]:
         """Tree of the fields, as `reflection` has it."""
-        return _tree(self.kind.DESCRIPTOR, depth, [MOST_FIELDS])
+        return _tree(self.kind.DESCRIPTOR, depth, [MAX_FIELDS])
 
     def parse(self, raw: bytes) -> Any:
         """Message from its bytes.
@@ -63,7 +63,7 @@ class Protobuf:
 
     def numbers(self, message: Any) -> Iterator[Path]:
         """Paths of all numbers in a message, without those of messages that are not set."""
-        yield from islice(_numbers(message, ()), MOST_FIELDS)
+        yield from islice(_numbers(message, ()), MAX_FIELDS)
 
     def new(self, values: Sequence[tuple[Sequence[str | int], Any]]) -> bytes:
         """Bytes of a message with these fields; all others keep their default."""
@@ -81,18 +81,18 @@ class Protobuf:
         return bytes(message.SerializeToString())
 
 
-def _tree(descriptor: Any, depth: int, left: list[int]) -> dict[str, Any]:
-    """Tree of a message's fields; `left` counts down those that may still be searched."""
+def _tree(descriptor: Any, depth: int, budget: list[int]) -> dict[str, Any]:
+    """Tree of a message's fields; `budget` counts down those that may still be searched."""
     fields: dict[str, Any] = {}
     for field in descriptor.fields:
-        left[0] -= 1
-        if left[0] < 0:
+        budget[0] -= 1
+        if budget[0] < 0:
             break
         numeric = _is_number(field)
         if field.is_repeated:
             fields[field.name] = ("matrix" if "covariance" in field.name.lower() else "vector") if numeric else ""
         elif field.message_type is not None:
-            fields[field.name] = _tree(field.message_type, depth - 1, left) if depth else ""
+            fields[field.name] = _tree(field.message_type, depth - 1, budget) if depth else ""
         else:
             fields[field.name] = "number" if numeric else "text" if field.cpp_type == field.CPPTYPE_STRING else ""
     return fields

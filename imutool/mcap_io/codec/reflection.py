@@ -233,8 +233,8 @@ def _in_si(found: Reflected, form: ros2_definition.DescribedCdr | Json) -> Refle
     """Fields of an IMU with the sizes of the units that the definition states."""
     first = (form.comments(found.vectors[0]), STATED["gyro"]), (form.comments(found.vectors[3]), STATED["accel"])
     stated = dict(zip(STATED, (_stated(comments, units) for comments, units in first), strict=True))
-    said = ", ".join(f"{sensor} in {unit}" for sensor, (unit, _) in stated.items() if unit)
-    return replace(found, sizes=(stated["gyro"][1], stated["accel"][1]), units=said)
+    names = ", ".join(f"{sensor} in {unit}" for sensor, (unit, _) in stated.items() if unit)
+    return replace(found, sizes=(stated["gyro"][1], stated["accel"][1]), units=names)
 
 
 def _stated(comments: Iterable[str], units: Mapping[str, tuple[str, float]]) -> tuple[str, float]:

@@ -15,7 +15,7 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 from imutool.errors import LogError
-from imutool.mcap_io.codec.formats import DEEPEST, MOST_FIELDS
+from imutool.mcap_io.codec.formats import DEEPEST, MAX_FIELDS
 from imutool.mcap_io.codec.schemas import IMU, ByteWalk, definition
 
 NUMBERS = {
@@ -33,9 +33,9 @@ TIMES = {  # the types of the seconds; ROS 1 has no package for them
     "duration": "int32",
 }
 PADDING = 4  # bytes to which some writers fill up a payload
-MOST_TEXT = 1 << 20  # bytes of a definition
+MAX_TEXT = 1 << 20  # bytes of a definition
 VECTORS = 3, 4  # numbers of a vector and of a quaternion, which are fields of their own
-MOST_COUNTED = 4096  # counts and texts before a number in one message
+MAX_COUNTED = 4096  # counts and texts before a number in one message
 
 _FIELD = re.compile(
     r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?P<bound><=)?(?P<count>\d*)\])?\s+(?P<name>[A-Za-z]\w*)(?P<rest>|\s.*|=.*)"
@@ -75,8 +75,8 @@ def parse(schema_name: str, text: bytes) -> Definition:
     Raises:
         LogError: a line that is none of a definition, a message that is not defined, or one that contains itself.
     """
-    if len(text) > MOST_TEXT:
-        raise LogError(f"the definition of {schema_name} has {len(text)} bytes", expected=f"at most {MOST_TEXT}")
+    if len(text) > MAX_TEXT:
+        raise LogError(f"the definition of {schema_name} has {len(text)} bytes", expected=f"at most {MAX_TEXT}")
     root = _short(schema_name)
     known: dict[str, tuple[Field, ...]] = {
         name: (Field("sec", kind, None), Field("nanosec", "uint32", None)) for name, kind in TIMES.items()
@@ -97,7 +97,7 @@ def is_imu_of_ros(text: bytes) -> bool:
         own, ros = (parse(IMU, each) for each in (text, definition(IMU).encode()))
         vectors = "geometry_msgs/Vector3", "geometry_msgs/Quaternion"
         pairs = [([f[:3] for f in own.get(name, ())], [f[:3] for f in ros[name]]) for name in (_short(IMU), *vectors)]
-        return all(mine in ([], theirs) for mine, theirs in pairs)
+        return all(own_fields in ([], standard_fields) for own_fields, standard_fields in pairs)
     return True
 
 
@@ -221,8 +221,8 @@ class Walk(ByteWalk):
     def word(self, value: int = 0) -> int:
         """A count or a length; LogError where there are too many."""
         found = super().word(value)
-        if len(self.constants) > MOST_COUNTED:
-            raise LogError(f"more than {MOST_COUNTED} texts and counts in one message", fix="Choose a field before them")
+        if len(self.constants) > MAX_COUNTED:
+            raise LogError(f"more than {MAX_COUNTED} texts and counts in one message", fix="Choose a field before them")
         return found
 
 
@@ -236,18 +236,18 @@ class DescribedCdr:
 
     def tree(self, depth: int) -> dict[str, Any]:
         """Tree of the fields, as `reflection` has it."""
-        return self._tree(self._definition[""][0].kind, depth, [MOST_FIELDS])
+        return self._tree(self._definition[""][0].kind, depth, [MAX_FIELDS])
 
-    def _tree(self, kind: str, depth: int, left: list[int]) -> dict[str, Any]:
+    def _tree(self, kind: str, depth: int, budget: list[int]) -> dict[str, Any]:
         fields: dict[str, Any] = {}
         for field in self._definition[kind]:
-            left[0] -= 1
-            if left[0] < 0:
+            budget[0] -= 1
+            if budget[0] < 0:
                 break
             if field.kind in NUMBERS:
                 fields[field.name] = {None: "number", 3: "vector"}.get(field.length, "")
             elif field.kind in self._definition and field.length is None and depth:
-                fields[field.name] = self._tree(field.kind, depth - 1, left)
+                fields[field.name] = self._tree(field.kind, depth - 1, budget)
         return fields
 
     def comments(self, path: Sequence[str | int]) -> Iterator[str]:

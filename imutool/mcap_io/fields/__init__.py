@@ -186,30 +186,30 @@ def _numeric(log: Log, topic: str, message: bytes | None, *, long: bool) -> list
 
 
 def others(
-    path: Location, signal: str, most: int = MAX_OTHERS, skip: Collection[str] = (), *, gaps: bool = False
+    path: Location, signal: str, maximum: int = MAX_OTHERS, skip: Collection[str] = (), *, gaps: bool = False
 ) -> dict[str, Fields]:
     """Every other varying number of a log by TOPIC.field: candidates to drive a signal.
 
     Left out are stamps, covariances, constants, long arrays (images), unreadable or computed topics, those in `skip`, all that
-    vary behind the first `most`, and fields with NaN or stamps that do not increase; with `gaps`, only such rows of theirs.
+    vary behind the first `maximum`, and fields with NaN or stamps that do not increase; with `gaps`, only such rows of theirs.
 
     Raises:
         ConfigError, LogError: the log cannot be opened, or is damaged.
     """
     with PlainLog(path) as log:
-        readers, left = dict[str, Reader](), READ_FACTOR * most
+        readers, remaining = dict[str, Reader](), READ_FACTOR * maximum
         asked = {name: topic for name, topic in log.topics.items() if name not in skip and not topic.is_derived}
         first = log.firsts(asked)
         for name, topic in asked.items():
             paths = _offered(log, name, first.pop(name, None))
-            paths = [inside for inside in paths if f"{name}.{inside}" != signal and not _NO_CHANNEL.search(inside)][:left]
+            paths = [inside for inside in paths if f"{name}.{inside}" != signal and not _NO_CHANNEL.search(inside)][:remaining]
             if paths:
-                readers[name], left = Reader(log, topic, tuple(paths), strict=False), left - len(paths)
+                readers[name], remaining = Reader(log, topic, tuple(paths), strict=False), remaining - len(paths)
         for name, rows in log.rows(list(readers)):
             with log.named(name):
                 readers[name].take(rows)
     offered = ((f"{name}.{inside}", reader.usable(inside, gaps)) for name, reader in readers.items() for inside in reader.paths)
-    return dict(islice(((name, values) for name, values in offered if values is not None), most))
+    return dict(islice(((name, values) for name, values in offered if values is not None), maximum))
 
 
 def _offered(log: Log, topic: str, message: bytes | None) -> list[str]:

@@ -108,10 +108,8 @@ def _parse_idl(schema_name: str, text: bytes) -> Definition:
     Raises:
         LogError: rosbags is not installed or cannot read it, or as `parse`.
     """
-    if len(text) > ros2_definition.MOST_TEXT:
-        raise LogError(
-            f"the definition of {schema_name} has {len(text)} bytes", expected=f"at most {ros2_definition.MOST_TEXT}"
-        )
+    if len(text) > ros2_definition.MAX_TEXT:
+        raise LogError(f"the definition of {schema_name} has {len(text)} bytes", expected=f"at most {ros2_definition.MAX_TEXT}")
     try:
         from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_typestore
     except ImportError as error:

@@ -42,7 +42,7 @@ class Habits(NamedTuple):
 
     def contradicts(self, other: Habits) -> bool:
         """Whether no writer has both."""
-        return any(mine and its and not mine & its for mine, its in zip(self, other, strict=True))
+        return any(own and its and not own & its for own, its in zip(self, other, strict=True))
 
 
 NO_HABITS = Habits()

@@ -132,8 +132,8 @@ class Recordings:
         """Notes the sizes of a recording's messages, and a block to compare others with."""
         for channel in found.sizes.keys() & recording.readable():  # what is not defined yet may be another log's
             low, high = found.sizes[channel]
-            least, most = recording.sizes.get(channel, (low, high))
-            recording.sizes[channel] = min(low, least), max(high, most)
+            minimum, maximum = recording.sizes.get(channel, (low, high))
+            recording.sizes[channel] = min(low, minimum), max(high, maximum)
             recording.samples.setdefault(channel, found.block)
 
     def _verify(self, found: ScannedBlock, recording: Recording) -> None:

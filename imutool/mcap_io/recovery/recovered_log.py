@@ -105,9 +105,9 @@ class RecoveredLog(Log):
         if found is None or block.edited:
             return True
         for channel in block.indexes:
-            mine = found.heads["channel"] == channel
+            of_channel = found.heads["channel"] == channel
             listed = self.index.entries(block, channel)
-            actual = np.column_stack([found.heads["log_time"][mine], found.offsets[mine].astype(np.uint64)])
+            actual = np.column_stack([found.heads["log_time"][of_channel], found.offsets[of_channel].astype(np.uint64)])
             if listed.shape != actual.shape or not (listed[np.argsort(listed[:, 1])] == actual).all():
                 return False
         return True

@@ -34,7 +34,7 @@ from imutool.processes.system import copy_by_kernel
 PARTIAL = re.compile(r"\.(?P<name>.+)\.(?P<pid>\d+)\.(?P<mark>[0-9a-f]{24})\.partial", re.DOTALL)
 MARK_PART = 6  # hexadecimal digits of each part of a mark
 LONGEST_NAME = 180  # bytes of a name in the temporary one; a file system takes 255
-MOST_ENTRIES = 20_000  # of a folder that is searched for temporary files: some 20 ms
+MAX_ENTRIES = 20_000  # of a folder that is searched for temporary files: some 20 ms
 OPEN_FILE = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
 STANDARD = {"/dev/stdout": 1, "/dev/stderr": 2}
 
@@ -70,11 +70,11 @@ class LocalFile:
 
     def copy(self, source: Source, start: int, end: int) -> int:
         """Copies by the kernel; returns `start` if the kernel cannot."""
-        theirs, ours = descriptor(source.file), descriptor(self.file)
-        if theirs is None or ours is None:
+        source_descriptor, own_descriptor = descriptor(source.file), descriptor(self.file)
+        if source_descriptor is None or own_descriptor is None:
             return start
         self.file.flush()
-        start = copy_by_kernel(theirs, ours, start, end)
+        start = copy_by_kernel(source_descriptor, own_descriptor, start, end)
         self.file.seek(0, os.SEEK_END)
         return start
 
@@ -165,7 +165,7 @@ def _short(name: str) -> str:
 def remove_abandoned(path: Path) -> None:
     """Remove temporary files and folders of a place whose process was killed, by the rule above.
 
-    In a folder of more than `MOST_ENTRIES` entries only so many are looked at.
+    In a folder of more than `MAX_ENTRIES` entries only so many are looked at.
     """
     place = path.absolute()
     with contextlib.suppress(OSError):
@@ -181,7 +181,7 @@ def remove_abandoned(path: Path) -> None:
 
 def _entries(folder: Path) -> Iterator[Path]:
     with os.scandir(folder) as entries:
-        yield from (Path(entry.path) for entry in islice(entries, MOST_ENTRIES) if entry.name.endswith(".partial"))
+        yield from (Path(entry.path) for entry in islice(entries, MAX_ENTRIES) if entry.name.endswith(".partial"))
 
 
 def _is_abandoned(path: Path, pid: int, mark: str) -> bool:
@@ -198,8 +198,8 @@ def _is_abandoned(path: Path, pid: int, mark: str) -> bool:
         return True
     except OSError:  # it lives, under another user
         return False
-    now = _start(pid)
-    return now is not None and now != start
+    current = _start(pid)
+    return current is not None and current != start
 
 
 @functools.cache

@@ -97,14 +97,14 @@ def refuse_existing(path: Location, *, overwrite: bool, choose: str = "Choose an
     if is_folder(path):
         raise ConfigError("the target is a folder", where=path, expected="the name of a file")
     if not isinstance(path, Path):
-        there = exists(path)
+        is_taken = exists(path)
     elif is_stream(path):
         return
     elif path.is_block_device() or path.is_socket():
         raise ConfigError("the target is a disk or a socket", where=path, expected="the name of a file")
     else:
-        there = os.path.lexists(path)  # a link to nothing is there too
-    if there and not overwrite:
+        is_taken = os.path.lexists(path)  # a link to nothing is there too
+    if is_taken and not overwrite:
         raise ConfigError("the target exists", where=path, fix=f"{choose}, or add `overwrite=True`")
 
 
@@ -244,9 +244,9 @@ def _refuse_existing_output(output: OutputFile, overwrite: bool) -> None:
     if exists(place) and not is_folder(place):
         raise ConfigError("is a file", where=place, expected="a folder, which need not exist")
     if isinstance(place, Path) and place.is_dir() and not overwrite:
-        there = sorted(e.name for e in place.iterdir() if any(fnmatchcase(e.name, pattern) for pattern in output.files))
-        if there:
-            raise ConfigError("the target exists", where=place / there[0], fix="Choose another folder, or add `overwrite=True`")
+        taken = sorted(e.name for e in place.iterdir() if any(fnmatchcase(e.name, pattern) for pattern in output.files))
+        if taken:
+            raise ConfigError("the target exists", where=place / taken[0], fix="Choose another folder, or add `overwrite=True`")
 
 
 def _refuse_existing_files(output: OutputFile, inputs: Sequence[str]) -> None:

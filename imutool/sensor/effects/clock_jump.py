@@ -44,10 +44,10 @@ def _steps(trend: Float64[np.ndarray, "n p"], common: Column, power: Column) -> 
     """Size of the step after each sample but the last, on a trend of the offset, and the squares that it explains."""
     whole = np.linalg.pinv(trend.T @ (power[:, None] * trend))
     after = np.cumsum((power[:, None] * trend)[::-1], axis=0)[::-1][1:]
-    left = np.cumsum(common[::-1])[::-1][1:] - after @ whole @ (trend.T @ common)
+    residual = np.cumsum(common[::-1])[::-1][1:] - after @ whole @ (trend.T @ common)
     own = np.cumsum(power[::-1])[::-1][1:] - np.einsum("np,pq,nq->n", after, whole, after)
-    step = np.where(own > NOTHING * power.sum(), left, 0.0) / np.maximum(own, NOTHING * power.sum())
-    return step, step * left
+    step = np.where(own > NOTHING * power.sum(), residual, 0.0) / np.maximum(own, NOTHING * power.sum())
+    return step, step * residual
 
 
 EFFECT = Effect(

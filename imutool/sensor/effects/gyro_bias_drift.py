@@ -20,18 +20,18 @@ STEADY_TAU_S = 86400.0
 
 def warm_up(sensor: Sensor, unit: str, plausible: float) -> Effect:
     """Warm-up of either sensor: A, then tau (s)."""
-    course_of = Remembered(_course)
+    relaxation_of = Remembered(_relaxation)
 
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
-        added = np.outer(theta[:3], course_of(samples.stamp_s, float(theta[3]))).T
+        added = np.outer(theta[:3], relaxation_of(samples.stamp_s, float(theta[3]))).T
         return samples.with_added(sensor, added)
 
     def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
         """Amplitudes by least squares, with a constant, for each tau."""
         error, found = residual(motion, samples)[0 if sensor == "gyro" else 1], []
         for tau_s in START_TAU_S:
-            course = _course(samples.stamp_s, tau_s)
-            columns = np.stack([course, np.ones_like(course)], axis=1)
+            relaxation = _relaxation(samples.stamp_s, tau_s)
+            columns = np.stack([relaxation, np.ones_like(relaxation)], axis=1)
             found.append(np.append(np.linalg.lstsq(columns, error, rcond=None)[0][0], tau_s))
         return found
 
@@ -71,7 +71,7 @@ def within(effects: Sequence[Effect], end_s: float) -> Iterator[Effect]:
 
 def _steady(warming: Effect, share: float) -> Effect:
     *amplitudes, tau = warming.parameters
-    sizes = (replace(one, plausible=one.plausible / share) for one in amplitudes)
+    sizes = (replace(amplitude, plausible=amplitude.plausible / share) for amplitude in amplitudes)
     fixed = replace(tau, plausible=STEADY_TAU_S, null_value=STEADY_TAU_S)
     return replace(
         warming,
@@ -87,7 +87,7 @@ def _reached(end_s: float, tau_s: float) -> float:
     return -float(np.expm1(-end_s / tau_s))
 
 
-def _course(stamp_s: Float64[np.ndarray, " n"], tau_s: float) -> Float64[np.ndarray, " n"]:
+def _relaxation(stamp_s: Float64[np.ndarray, " n"], tau_s: float) -> Float64[np.ndarray, " n"]:
     return np.asarray(-np.expm1(-stamp_s / tau_s))
 
 

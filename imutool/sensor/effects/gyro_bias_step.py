@@ -105,9 +105,9 @@ def _largest(
     """Size of what explains most by setting in, beside orthonormal columns, and the sample before it."""
     rest = error - basis @ (basis.T @ error)
     own = [_from_on(x**2) - (_from_on(basis * x[:, None]) ** 2).sum(axis=1) for x in columns.T]
-    least = np.maximum((columns**2).mean(axis=0), np.finfo(np.float64).tiny)
+    minimum = np.maximum((columns**2).mean(axis=0), np.finfo(np.float64).tiny)
     sums = _from_on(rest * columns)
-    size = sums / np.maximum(np.stack(own, axis=1), least)
+    size = sums / np.maximum(np.stack(own, axis=1), minimum)
     gain = (sums * size / np.maximum((rest**2).mean(axis=0), np.finfo(np.float64).tiny)).sum(axis=1)
     row = int(np.argmax(np.where((t_s[1:] > t_s[0] + EDGE_S) & (t_s[:-1] < t_s[-1] - EDGE_S), gain, 0.0)))
     return size[row], row

@@ -12,7 +12,7 @@ from imutool.sensor.samples import IdealMotion, SensorSamples
 
 STEEP = 0.02  # of the width, in which a reading sets in: a derivative needs an edge that some samples lie on
 WIDTHS = 20  # that differ: halves and doubles of one have other samples in the band
-LEAST_RAD_S = 1e-6  # of a start: no digit of any gyro is finer
+MIN_RAD_S = 1e-6  # of a start: no digit of any gyro is finer
 LOG_STEP = 0.02  # of the derivative by the width
 ZONE = "zone"  # variant in which faster readings lose the width
 LOST = Parameter("lost", "-", 1.0, null_value=0.0)  # of the width, by faster readings
@@ -37,7 +37,7 @@ def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     error = error - np.median(error, axis=0)
     rate, better = np.abs(ideal).ravel(), (error**2 - (error + ideal) ** 2).ravel()
     order = np.argsort(rate)
-    width = max(float(rate[order][np.argmax(np.cumsum(better[order]))]), LEAST_RAD_S)
+    width = max(float(rate[order][np.argmax(np.cumsum(better[order]))]), MIN_RAD_S)
     return [np.array([width, LOST.null_value]), np.array([0.5 * width, LOST.plausible])]
 
 

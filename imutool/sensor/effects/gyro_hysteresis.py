@@ -15,7 +15,7 @@ from imutool.sensor.effect import Effect, Parameter, Stage, Theta, residual
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import Sensor
 
-LEAST = 1e-4  # of the plausible width, where a fit starts at least
+MIN = 1e-4  # of the plausible width, where a fit starts at least
 LOG_STEP = 0.02  # of the derivative by the width
 SHARE = Parameter("share", "-", 0.3, null_value=1.0)  # of the reading that lags
 
@@ -32,7 +32,7 @@ def hysteresis(sensor: Sensor, symbol: str, unit: str, plausible: float, observa
         """The width by which the samples lag on the way up and on the way down."""
         error, ideal = error_and_ideal(sensor, motion, samples)
         behind = -float(np.mean(error * np.sign(np.gradient(ideal, axis=0))))
-        return [np.array([max(behind, LEAST * plausible), SHARE.null_value])]
+        return [np.array([max(behind, MIN * plausible), SHARE.null_value])]
 
     return Effect(
         f"{sensor}_hysteresis",

@@ -30,7 +30,7 @@ from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import IdealMotion, SensorSamples, Vectors
 from imutool.units import SENSORS, Sensor
 
-MOST = 0.4999  # cycles a sample of a digital filter: its gain is 0 at a half
+MAX = 0.4999  # cycles a sample of a digital filter: its gain is 0 at a half
 START_HZ = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
 FORGOTTEN = 4.0  # periods of the cut-off frequency, after which less than 1e-10 of a sample is left
 AHEAD, BEHIND = 5, 8  # samples that a tap looks ahead and back: this is no filter for samples as they arrive
@@ -79,7 +79,7 @@ class Design(NamedTuple):
         """Design of an effect of this or of second order."""
         values = dict(zip((parameter.name for parameter in effect.parameters), theta.tolist(), strict=True))
         values |= {parameter.name: value for parameter, value in effect.constants}
-        rates = (values.get(one.name, math.inf) for one in (RATE, SMOOTHING))
+        rates = (values.get(rate.name, math.inf) for rate in (RATE, SMOOTHING))
         return cls(float(theta[0]), values.get("zeta"), next(rates), values.get(ORDER.name, 1.0), next(rates))
 
     @property
@@ -99,7 +99,7 @@ class Design(NamedTuple):
         twice_zeta = float(-self.poles.real.sum()) if self.zeta is None else 2.0 * self.zeta
         cutoff = math.pi * self.cutoff_hz
         if math.isfinite(self.rate_hz):
-            cutoff = self.rate_hz * math.tan(min(cutoff / self.rate_hz, math.pi * MOST))
+            cutoff = self.rate_hz * math.tan(min(cutoff / self.rate_hz, math.pi * MAX))
         return 0.5 * twice_zeta / cutoff
 
     @property
@@ -127,7 +127,7 @@ class Design(NamedTuple):
             return np.asarray(np.prod((1.0 - self.kept) / (1.0 - self.kept * one_later), axis=1))
         x = f_hz / self.cutoff_hz
         if math.isfinite(self.rate_hz):
-            x = _folded_tan(f_hz / self.rate_hz) / math.tan(math.pi * min(self.cutoff_hz / self.rate_hz, MOST))
+            x = _folded_tan(f_hz / self.rate_hz) / math.tan(math.pi * min(self.cutoff_hz / self.rate_hz, MAX))
         if self.zeta is not None:
             return np.asarray(1.0 / (1.0 - x**2 + 2j * self.zeta * x))
         return np.asarray(1.0 / np.prod(1.0 - 1j * x[:, None] / self.poles, axis=1))
@@ -157,7 +157,7 @@ def _design(theta: Theta) -> Design:
 
 def _folded_tan(f: Float64[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
     """tan(pi f), f in cycles a sample of a filter, to which whole numbers are alike."""
-    return np.asarray(np.tan(np.pi * np.clip(f - np.round(f), -MOST, MOST)))
+    return np.asarray(np.tan(np.pi * np.clip(f - np.round(f), -MAX, MAX)))
 
 
 class _Gain(NamedTuple):
@@ -265,7 +265,7 @@ def of_one(effect: Effect, sensor: Sensor) -> Effect:
 
 def of_signal(effect: Effect, signal: str) -> Effect:
     """A low-pass of the one sensor that a signal names; any other effect itself."""
-    sensor = next((one for one in SENSORS if one == signal), None)
+    sensor = next((name for name in SENSORS if name == signal), None)
     return effect if effect.lagless is None or sensor is None else of_one(effect, sensor)
 
 

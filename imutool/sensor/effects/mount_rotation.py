@@ -14,7 +14,7 @@ from imutool.sensor.samples import IdealMotion, SensorSamples, Vectors
 
 NOTHING_MOVES = 1e-9  # rad/s or m/s², below which a sensor says nothing
 NEAR_RAD = 0.3  # up to which a fit that begins without a rotation finds it
-MOST = 0.5  # of the squares, that may be left: between noise and noise every rotation leaves as much
+MAX = 0.5  # of the squares, that may be left: between noise and noise every rotation leaves as much
 
 
 def _forward(motion: IdealMotion, phi: Theta) -> IdealMotion:
@@ -41,8 +41,8 @@ def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     body, sensor = (np.concatenate([pair[k] / max(pair[0].std(), NOTHING_MOVES) for pair in pairs]) for k in (0, 1))
     U, _, Vt = np.linalg.svd(body.T @ sensor)
     turned = Rotation.from_matrix(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
-    left, before = (float(((body - one) ** 2).sum()) for one in (turned.apply(sensor), sensor))
-    return [np.zeros(3), *([turned.as_rotvec()] if turned.magnitude() > NEAR_RAD and left < MOST * before else [])]
+    squares, before = (float(((body - vectors) ** 2).sum()) for vectors in (turned.apply(sensor), sensor))
+    return [np.zeros(3), *([turned.as_rotvec()] if turned.magnitude() > NEAR_RAD and squares < MAX * before else [])]
 
 
 EFFECT = Effect(

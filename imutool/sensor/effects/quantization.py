@@ -22,9 +22,9 @@ def _forward(samples: SensorSamples, lsb: Theta) -> SensorSamples:
 
 def _smallest_step(values: Float64[np.ndarray, "n 3"]) -> float:
     """Smallest step between distinct values of an axis; negligible where every axis is constant."""
-    least = max(SAME * float(np.abs(values).max()), np.finfo(np.float64).tiny)
+    minimum = max(SAME * float(np.abs(values).max()), np.finfo(np.float64).tiny)
     steps = np.diff(np.sort(values, axis=0), axis=0)
-    return float(steps[steps > least].min(initial=np.inf)) if (steps > least).any() else least
+    return float(steps[steps > minimum].min(initial=np.inf)) if (steps > minimum).any() else minimum
 
 
 def _starts(_motion: IdealMotion, samples: SensorSamples) -> list[Theta]:

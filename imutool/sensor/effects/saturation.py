@@ -13,7 +13,7 @@ NEVER = 100.0  # times the largest reading is not reached
 
 
 def _forward(samples: SensorSamples, limit: Theta) -> SensorSamples:
-    gyro, accel = (None if math.isinf(most) else most for most in limit.tolist())
+    gyro, accel = (None if math.isinf(maximum) else maximum for maximum in limit.tolist())
     return samples.with_readings(
         None if gyro is None else np.clip(samples.gyro, -gyro, gyro),
         None if accel is None else np.clip(samples.accel, -accel, accel),

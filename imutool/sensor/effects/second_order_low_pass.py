@@ -18,7 +18,7 @@ from imutool.sensor.effects.low_pass import OMEGA, RATE, SMOOTHING, Design, Filt
 from imutool.sensor.samples import IdealMotion
 
 BUTTERWORTH = 0.7  # damping, nearly
-LEAST_DAMPING = 0.2  # less rings, and passes no more of slow motion than of fast
+MIN_DAMPING = 0.2  # less rings, and passes no more of slow motion than of fast
 START_HZ = (5.0, 12.0, 30.0, 80.0)
 
 
@@ -61,7 +61,7 @@ EFFECT = Effect(
     "d²gyro/dt² = w_c² (omega - gyro) - 2 zeta w_c dgyro/dt, w_c = 2 pi f_c, and likewise accel (at a rate: bilinear)",
     (
         Parameter("f_c", "Hz", 40.0, positive=True, null_value=math.inf),
-        Parameter("zeta", "-", BUTTERWORTH, positive=True, null_value=BUTTERWORTH, least=LEAST_DAMPING),
+        Parameter("zeta", "-", BUTTERWORTH, positive=True, null_value=BUTTERWORTH, minimum=MIN_DAMPING),
         RATE,
         SMOOTHING,
     ),

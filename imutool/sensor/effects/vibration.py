@@ -11,7 +11,7 @@ from imutool.inertial.stationary import white_noise
 from imutool.sensor.effect import Effect, Parameter, Remembered, Stage, Theta, residual
 from imutool.sensor.samples import IdealMotion, SensorSamples
 
-LEAST_HZ = 3.0  # slower is motion, drift or another effect, and no vibration
+MIN_HZ = 3.0  # slower is motion, drift or another effect, and no vibration
 LINES = 3  # starts: the strongest lines of the residual
 FINER = 4  # times as many frequencies as samples tell: the top of a peak lies between three of them
 ABOUT = 401  # frequencies whose median tells what a line stands out from
@@ -103,9 +103,9 @@ def is_motion(
     A body that moves periodically, as in walking, has lines, and poses that were smoothed lose a part of each.
     """
     noise = white_noise(by_poses + line)
-    here, there = (line_power(stamp_s, one, f_hz, noise=noise) for one in (line, by_poses))
+    in_residual, in_poses = (line_power(stamp_s, samples, f_hz, noise=noise) for samples in (line, by_poses))
     rate_hz = (len(stamp_s) - 1) / (stamp_s[-1] - stamp_s[0])
-    return there > IN_POSES * here and line_p_value(by_poses, float(rate_hz), f_hz) < chance
+    return in_poses > IN_POSES * in_residual and line_p_value(by_poses, float(rate_hz), f_hz) < chance
 
 
 def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
@@ -129,7 +129,7 @@ def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     out = level - median_filter(level, min(ABOUT, len(level)))
     peaks = 1 + np.flatnonzero((out[1:-1] >= out[:-2]) & (out[1:-1] >= out[2:]))
     starts = []
-    peaks = peaks[f_hz[peaks] > LEAST_HZ] if (f_hz[peaks] > LEAST_HZ).any() else peaks
+    peaks = peaks[f_hz[peaks] > MIN_HZ] if (f_hz[peaks] > MIN_HZ).any() else peaks
     for peak in peaks[np.argsort(out[peaks])[::-1][:LINES]]:
         line_hz = _top(f_hz, level, int(peak))
         amplitudes = np.linalg.lstsq(_waves(t_s, line_hz), error, rcond=None)[0]
@@ -151,7 +151,7 @@ EFFECT = Effect(
     "accel, gyro += s sin(2 pi f t) + c cos(2 pi f t)",
     (
         Parameter(
-            "f", "Hz", 50.0, positive=True, null_value=50.0, step=1e-7, least=LEAST_HZ
+            "f", "Hz", 50.0, positive=True, null_value=50.0, step=1e-7, minimum=MIN_HZ
         ),  # 90 s of 50 Hz turn the phase by 3e-3 rad
         *(Parameter(f"accel_{of}_{axis}", "m/s²", 0.5) for axis in "xyz" for of in ("sin", "cos")),
         *(Parameter(f"gyro_{of}_{axis}", "rad/s", 0.05) for axis in "xyz" for of in ("sin", "cos")),

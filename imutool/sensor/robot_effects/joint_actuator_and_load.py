@@ -27,7 +27,7 @@ SPREAD_M = 0.1  # of a payload about its centre
 OFFSET_M = 0.1  # of two axes of a wrist
 UNLIKE, NOISIEST = 0.5, 2.0  # of the needed effort: what acts may differ from it so much, and beyond that by such a noise
 PLAUSIBLE_S, MOVED = 0.05, 0.005
-LONGEST_S, LEAST_DELAYS, MOST_DELAYS = 0.08, 5, 40  # of a delay to start from, and how many are looked at
+LONGEST_S, MIN_DELAYS, MAX_DELAYS = 0.08, 5, 40  # of a delay to start from, and how many are looked at
 WIDTHS = (0.05, 0.15, 0.4)  # of a dead band, over the effort's standard deviation
 LIMITS = (0.5, 1.0, 1.5, 2.0)  # to start from, likewise
 ASKED = (0.05, 0.3)  # of the commands, the largest, while what acts is such a limit
@@ -123,7 +123,7 @@ def _delayed(taken_s: Samples, theta: Theta) -> Samples:
 
 def _delays(ideal: IdealSignal, real: SignalSamples, turn_s: float) -> list[Theta]:
     """None, and the delay that commands are most like: from others an effort that oscillates leads a period away."""
-    tried = np.linspace(0.0, LONGEST_S, int(np.clip(2.0 * LONGEST_S / turn_s, LEAST_DELAYS, MOST_DELAYS)))
+    tried = np.linspace(0.0, LONGEST_S, int(np.clip(2.0 * LONGEST_S / turn_s, MIN_DELAYS, MAX_DELAYS)))
 
     def unlike(delay_s: float) -> float:
         needed = ideal.sample(real.stamp_s + delay_s, real.stamp_s).x
@@ -191,5 +191,5 @@ def _limits(commands: Samples, needed: Samples, size: float) -> list[Theta]:
     """
     u, acts = np.abs(commands), np.abs(needed)
     moments = np.quantile(u, 1.0 - np.array(BEYOND))
-    plateaus = [np.median(acts[u >= least]) for least in np.quantile(u, 1.0 - np.array(ASKED))]
+    plateaus = [np.median(acts[u >= minimum]) for minimum in np.quantile(u, 1.0 - np.array(ASKED))]
     return [np.array([limit]) for limit in (*(share * size for share in LIMITS), *moments, *plateaus) if limit > 0.0]

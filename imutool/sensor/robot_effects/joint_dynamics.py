@@ -21,13 +21,13 @@ from imutool.sensor.robot_effects.planar_chain import chain_columns, mass_coeffi
 from imutool.sensor.robot_effects.signal_samples import Column, Columns, State
 from imutool.sensor.robot_effects.spatial_chain import Axes, SpatialChain, searched
 
-MOST_JOINTS = 7
-MOST_COMBINED = 3  # joints up to which all sums of angles are tried
+MAX_JOINTS = 7
+MAX_COMBINED = 3  # joints up to which all sums of angles are tried
 RIDGE = 1e-9
 ROUNDED = 1e-6  # of the longest column: one that ought to be zero, as gravity about an upright axis, holds rounding errors
 SCREENED = 1000  # samples that refute a wrong set of signs
 SEARCHED = 250  # samples that tell axes apart
-MOST_OFFSETS = 3  # lengths of an arm that a payload alone may show
+MAX_OFFSETS = 3  # lengths of an arm that a payload alone may show
 WELL_DETERMINED = 0.02  # of the efforts' size that a fit may leave
 STEEP = 0.01  # of a velocity's size, within which its sign turns
 
@@ -37,14 +37,13 @@ class Dynamics:
     """Efforts of an arm as a function of its motion (`q0`, `dq0`, `ddq0`, ...).
 
     `signs` are those of the angles of a chain of parallel hinges, empty for any other arm; `spatial` has the axes of another
-    chain of hinges. `left` is the standard deviation of what the fit did not explain, by joint; `order` are the joints from
-    base to tip, which a log need not keep.
+    chain of hinges. `residual_std` is that of the fit, by joint. `order` are the joints from base to tip; a log may differ.
     """
 
     joints: int
     signs: tuple[int, ...]
     coefficients: Float64[np.ndarray, "_ _"]
-    left: tuple[float, ...]
+    residual_std: tuple[float, ...]
     order: tuple[int, ...]
     spatial: SpatialChain | None = None
 
@@ -101,7 +100,7 @@ class Dynamics:
         if self.spatial is None:
             return float(np.mean(np.abs(self.links))) if self.links else 0.0 if self.signs and self.joints == 1 else None
         reach = float(np.linalg.norm(self.spatial.origin(self.coefficients[0])[0])) / np.sqrt(self.joints)
-        return reach if self.offsets <= MOST_OFFSETS else None
+        return reach if self.offsets <= MAX_OFFSETS else None
 
     @property
     def links(self) -> tuple[complex, ...]:
@@ -156,7 +155,7 @@ def general_factors(state: State, n: int) -> tuple[Float64[np.ndarray, "_ t"], F
 
 def _sums(n: int) -> Iterator[tuple[int, ...]]:
     """Sums of angles, each up to its sign."""
-    if n > MOST_COMBINED:
+    if n > MAX_COMBINED:
         yield from (tuple(int(first <= k <= last) for k in range(n)) for first in range(n) for last in range(first, n))
         return
     for weights in product((0, 1, -1), repeat=n):
@@ -172,7 +171,7 @@ def identified(state: State, efforts: Columns, near: Dynamics | None = None) -> 
     dynamics at nearly the same motion.
     """
     n, size = efforts.shape[1], np.maximum(efforts.std(axis=0), 1e-12)
-    if n > MOST_JOINTS:
+    if n > MAX_JOINTS:
         return None
     if near is not None and near.spatial is not None:
         order = near.order
@@ -185,7 +184,7 @@ def identified(state: State, efforts: Columns, near: Dynamics | None = None) -> 
 
     chains = list(found(_chain))
     if chains:
-        return min(chains, key=lambda chain: max(np.array(chain.left) / size))
+        return min(chains, key=lambda chain: max(np.array(chain.residual_std) / size))
     return next((dynamics for find in (_hinges, _general) for dynamics in found(find)), None)
 
 
@@ -209,9 +208,9 @@ def _spatial(
 ) -> Dynamics | None:
     """A chain of hinges with known axes."""
     theta, residual = _fitted(chain.columns(state), own_columns(state, len(order)), efforts, size)
-    left = residual.std(axis=0)
-    well = (left < WELL_DETERMINED * size).all()
-    return Dynamics(len(order), (), theta[None], _by_joint(left, order), order, chain) if well else None
+    residual_std = residual.std(axis=0)
+    well = (residual_std < WELL_DETERMINED * size).all()
+    return Dynamics(len(order), (), theta[None], _by_joint(residual_std, order), order, chain) if well else None
 
 
 def _fitted(
@@ -231,31 +230,31 @@ def _chain(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], orde
     for tail in product((1, -1), repeat=n - 1):
         for motion, wanted in sets:
             theta, residual = _fitted(chain_columns(motion, (1, *tail)), own_columns(motion, n), wanted, size)
-            left = residual.std(axis=0)
-            if (left > WELL_DETERMINED * size).any():
+            residual_std = residual.std(axis=0)
+            if (residual_std > WELL_DETERMINED * size).any():
                 break
         else:
-            if best is None or (left / size).max() < best[0]:
-                best = (left / size).max(), (1, *tail), theta[None], left
+            if best is None or (residual_std / size).max() < best[0]:
+                best = (residual_std / size).max(), (1, *tail), theta[None], residual_std
     return None if best is None else Dynamics(n, best[1], best[2], _by_joint(best[3], order), order)
 
 
 def following(state: State, efforts: Columns) -> list[int]:
     """Joints whose efforts follow from the motion of all joints."""
     n = efforts.shape[1]
-    if n > MOST_JOINTS:
+    if n > MAX_JOINTS:
         return []
-    left = _general_fit(state, efforts)[1]
-    return np.flatnonzero(left < WELL_DETERMINED * np.maximum(efforts.std(axis=0), 1e-12)).tolist()
+    residual_std = _general_fit(state, efforts)[1]
+    return np.flatnonzero(residual_std < WELL_DETERMINED * np.maximum(efforts.std(axis=0), 1e-12)).tolist()
 
 
 def _general(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> Dynamics | None:
     """Any other arm, its joints from base to tip; of more joints the sums of angles are too many to be tried."""
-    if len(order) > MOST_COMBINED:
+    if len(order) > MAX_COMBINED:
         return None
-    theta, left = _general_fit(state, efforts)
-    well = (left < WELL_DETERMINED * size).all()
-    return Dynamics(len(order), (), theta, _by_joint(left, order), order) if well else None
+    theta, residual_std = _general_fit(state, efforts)
+    well = (residual_std < WELL_DETERMINED * size).all()
+    return Dynamics(len(order), (), theta, _by_joint(residual_std, order), order) if well else None
 
 
 def _general_fit(state: State, efforts: Columns) -> tuple[Float64[np.ndarray, "n p"], Float64[np.ndarray, " n"]]:
@@ -267,8 +266,8 @@ def _general_fit(state: State, efforts: Columns) -> tuple[Float64[np.ndarray, "n
     columns, own = np.concatenate([common, np.stack(rates, axis=1)], axis=1), np.arange(2)
     kept = [np.concatenate([np.arange(common.shape[1]), common.shape[1] + 2 * k + own]) for k in range(n)]
     theta = _solved_each(columns, efforts, kept)
-    left = np.array([(efforts[:, k] - columns[:, kept[k]] @ theta[k]).std() for k in range(n)])
-    return theta, left
+    residual_std = np.array([(efforts[:, k] - columns[:, kept[k]] @ theta[k]).std() for k in range(n)])
+    return theta, residual_std
 
 
 def _by_joint(values: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> tuple[float, ...]:

@@ -16,8 +16,8 @@ from imutool.sensor.effect import Effect, Parameter, Theta
 from imutool.sensor.robot_effects.signal_samples import SignalSamples
 from imutool.sensor.robot_effects.signal_sizes import Scale
 
-STEEP, LEAST_STEEP = 3.0, 1e-3  # of the velocity's noise and size, within which its sign turns
-AT_REST, LEAST_REST = 4.0, 3  # of that velocity, and samples: a joint that turns round is faster
+STEEP, MIN_STEEP = 3.0, 1e-3  # of the velocity's noise and size, within which its sign turns
+AT_REST, MIN_REST = 4.0, 3  # of that velocity, and samples: a joint that turns round is faster
 PLAUSIBLE_SHARE = 0.5  # of the effort's standard deviation
 STRIBECK = (0.03, 0.1, 0.3)  # velocities to start from, over the standard deviation
 SLOWEST = 0.5  # a faster fall is Coulomb friction, over the standard deviation
@@ -40,9 +40,9 @@ class _Friction:
         if len(theta) > 1:
             force = force * np.exp(-((velocity / min(theta[1], self.slowest)) ** 2))
         if self.holds:
-            rests = binary_opening(np.abs(velocity) < AT_REST * self.steep, np.ones(LEAST_REST, bool))
-            held = np.clip(s.channel(self.command) - s.y[:, self.joint], -np.abs(theta[0]), np.abs(theta[0]))
-            force = np.where(rests, held, force)
+            rests = binary_opening(np.abs(velocity) < AT_REST * self.steep, np.ones(MIN_REST, bool))
+            stiction = np.clip(s.channel(self.command) - s.y[:, self.joint], -np.abs(theta[0]), np.abs(theta[0]))
+            force = np.where(rests, stiction, force)
         return s.with_added(self.joint, force)
 
 
@@ -68,7 +68,7 @@ def friction_effects(scale: Scale) -> Iterator[Effect]:
     """Coulomb, viscous and Stribeck friction of each joint."""
     for k in scale.columns:
         size, speed, unit = PLAUSIBLE_SHARE * scale.size[k], scale.state[f"dq{k}"], scale.units[k]
-        steep, slowest = max(STEEP * scale.state[f"noise{k}"], LEAST_STEEP * speed), SLOWEST * speed
+        steep, slowest = max(STEEP * scale.state[f"noise{k}"], MIN_STEEP * speed), SLOWEST * speed
         level = Parameter("level", unit, size)
         yield scale.effect(
             "coulomb_friction",
@@ -90,7 +90,7 @@ def friction_effects(scale: Scale) -> Iterator[Effect]:
             "stribeck_friction",
             (k,),
             "effort += level exp(-(velocity / slow)^2) sign(velocity)",
-            (level, Parameter("slow", "rad/s", speed, positive=True, step=0.02, least=4.0 * steep)),
+            (level, Parameter("slow", "rad/s", speed, positive=True, step=0.02, minimum=4.0 * steep)),
             _Friction(k, steep, "stribeck", slowest, scale.names[k]),
             "the joint turns slowly and fast, both ways",
             starts=[np.array([0.1 * size, share * speed]) for share in STRIBECK],

@@ -18,12 +18,12 @@ from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, SignalSamples
 from imutool.sensor.robot_effects.signal_sizes import Scale
 
-MOST_TEETH, LEAST_TURNS = 120.0, 1.5  # ripples a turn that are tried, and how many of them the motion has to show
+MAX_TEETH, MIN_TURNS = 120.0, 1.5  # ripples a turn that are tried, and how many of them the motion has to show
 STARTS = 2
-BINS_A_RADIAN = 4.0 * MOST_TEETH / np.pi  # eight to the shortest ripple
-MOST_BINS, FINER = 2**19, 7  # some 500 turns; so much closer than they are told apart are ripples tried
+BINS_A_RADIAN = 4.0 * MAX_TEETH / np.pi  # eight to the shortest ripple
+MAX_BINS, FINER = 2**19, 7  # some 500 turns; so much closer than they are told apart are ripples tried
 PLAUSIBLE_RAD = 0.05
-MOST_ECCENTRIC = 0.3  # of its radius, that a disc is off its centre: beyond, a reading has several angles before long
+MAX_ECCENTRIC = 0.3  # of its radius, that a disc is off its centre: beyond, a reading has several angles before long
 ROUNDS = 4  # to an angle from its reading: each leaves as much of the error as the disc is off its centre, of 0.1 rad 1e-5
 GAPS = (0.3, 1.0, 1.5)  # of a joint's play to start from, over twice the deviation of the misfit
 
@@ -46,14 +46,14 @@ class _Ripple:
         smooth = np.stack(
             [np.ones(len(q)), q, dq, np.sign(dq), ddq, np.sin(q), np.cos(q), s.x[:, self.joint], s.dx[:, self.joint]], axis=1
         )
-        left = real.y[:, self.joint] - s.x[:, self.joint]
-        left = left - smooth @ np.linalg.lstsq(smooth, left, rcond=None)[0]
+        residual = real.y[:, self.joint] - s.x[:, self.joint]
+        residual = residual - smooth @ np.linalg.lstsq(smooth, residual, rcond=None)[0]
         bins = np.floor((q - q.min()) * BINS_A_RADIAN)
-        near, shift = bins < MOST_BINS, float(q.min()) + 0.5 / BINS_A_RADIAN
-        sums = np.bincount(bins[near].astype(int), left[near])
+        near, shift = bins < MAX_BINS, float(q.min()) + 0.5 / BINS_A_RADIAN
+        sums = np.bincount(bins[near].astype(int), residual[near])
         length = next_fast_len(FINER * len(sums), real=True)
         per_turn = 2.0 * np.pi * BINS_A_RADIAN / length * np.arange(length // 2 + 1)
-        tried = (per_turn >= max(2.0, LEAST_TURNS * 2.0 * np.pi * BINS_A_RADIAN / len(sums))) & (per_turn < MOST_TEETH)
+        tried = (per_turn >= max(2.0, MIN_TURNS * 2.0 * np.pi * BINS_A_RADIAN / len(sums))) & (per_turn < MAX_TEETH)
         if not tried.any():
             return [np.array([0.0, 0.0, 2.0])]
         waves = (np.conj(rfft(sums, length)) * np.exp(1j * per_turn * shift))[tried] * 2.0 / near.sum()
@@ -73,7 +73,7 @@ class _Angle:
         q, dq, ddq = (ideal.state[f"{kind}{self.joint}"] for kind in ("q", "dq", "ddq"))
         if not self.eccentric:
             return ideal.with_state(**{f"q{self.joint}": q - theta[0]})
-        if np.hypot(*theta) > MOST_ECCENTRIC:
+        if np.hypot(*theta) > MAX_ECCENTRIC:
             return ideal
         angle = q  # that of the joint: where its disc reads q
         for _ in range(ROUNDS):
@@ -89,7 +89,7 @@ def effects(scale: Scale) -> Iterator[Effect]:
     for k in scale.columns:
         size, ripple = 0.5 * scale.size[k], _Ripple(k)
         waves = (Parameter("sine", scale.units[k], size), Parameter("cosine", scale.units[k], size))
-        per_turn = Parameter("per_turn", "1/turn", MOST_TEETH, step=0.02, null_value=0.0)
+        per_turn = Parameter("per_turn", "1/turn", MAX_TEETH, step=0.02, null_value=0.0)
         yield Effect(
             "gear_ripple",
             Stage.SENSOR,
@@ -132,7 +132,7 @@ def _on(scale: Scale, k: int) -> tuple[Any]:
 
 
 def _trials(_: Any) -> int:
-    return round(MOST_TEETH)
+    return round(MAX_TEETH)
 
 
 # ── in the position ──
@@ -140,10 +140,10 @@ def _trials(_: Any) -> int:
 
 def play(x: Samples, width: float) -> Samples:
     """Backlash operator: the output rests until the input has crossed the gap."""
-    out, now, half = np.empty(len(x)), float(x[0]), 0.5 * width
+    out, output, half = np.empty(len(x)), float(x[0]), 0.5 * width
     for i, value in enumerate(x.tolist()):
-        now = min(max(now, value - half), value + half)
-        out[i] = now
+        output = min(max(output, value - half), value + half)
+        out[i] = output
     return out
 
 

@@ -23,7 +23,7 @@ from imutool.sensor.robot_effects.signal_samples import State
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])  # of an axis where all angles are zero: most arms are built square
 STARTS, SEED = 10, 0
 EVALUATIONS = 30  # of a residual, with its derivatives, at most
-LEAST_MOMENT = 0.02  # of the tip against gravity, over the arm's size, that shows the links' lengths
+MIN_MOMENT = 0.02  # of the tip against gravity, over the arm's size, that shows the links' lengths
 Axes = Float64[np.ndarray, "n 3"]
 APART = 0.2  # of a direction that no place on the last link has
 UNSURE = 1e-3  # square of the sine from which on a product of inertia hides a length
@@ -99,10 +99,10 @@ class SpatialChain:
 
     def of_link(self, x: Float64[np.ndarray, " 3"], link: int = -1) -> Float64[np.ndarray, " u"]:
         """A vector of a link, the last one, in the directions of all links."""
-        out, left = np.zeros(2 * len(self.axes)), np.asarray(x, float)
+        out, orthogonal = np.zeros(2 * len(self.axes)), np.asarray(x, float)
         for k in reversed(range(len(self.axes))[: link + 1 or None]):
-            out[2 * k : 2 * k + 2] = self.bases[k].T @ left
-            left = self.axes[k] * float(self.axes[k] @ left)
+            out[2 * k : 2 * k + 2] = self.bases[k].T @ orthogonal
+            orthogonal = self.axes[k] * float(self.axes[k] @ orthogonal)
         return out
 
     def origin(self, theta: Float64[np.ndarray, " _"]) -> tuple[Float64[np.ndarray, " u"], Float64[np.ndarray, "u m"]]:
@@ -125,7 +125,7 @@ class SpatialChain:
                 N += float(A[j] @ A[j]) * (np.eye(2) - (1.0 - weight) * P)
                 g += (np.eye(2) - (1.0 - weight) * P) @ S[i, :, j] @ A[j]
             squares, directions = np.linalg.eigh(shown)
-            known = np.sqrt(GRAVITY_M_S2 * np.maximum(squares, 0.0)) >= LEAST_MOMENT**2 * size
+            known = np.sqrt(GRAVITY_M_S2 * np.maximum(squares, 0.0)) >= MIN_MOMENT**2 * size
             kept = directions[:, known]
             out[i] = kept @ np.linalg.solve(kept.T @ N @ kept, kept.T @ g)
             unknown += [np.kron(np.eye(n)[i], d) for d in directions[:, ~known].T]
@@ -196,8 +196,8 @@ def _descended(axes: Axes, cost: Cost) -> tuple[Axes, float]:
     while turned:
         turned = False
         for other in _neighbours(axes):
-            if (now := cost(other)) < best:
-                axes, best, turned = other, now, True
+            if (moved_cost := cost(other)) < best:
+                axes, best, turned = other, moved_cost, True
     return axes, best
 
 

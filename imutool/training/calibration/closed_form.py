@@ -123,7 +123,7 @@ def solve(
         by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(own_prior) - 3]
         e = e + (by_nuisance @ _apart(own, turns)[windows.log, 3:, None])[..., 0]
         u = step_means(windows.segment.of(sensor)[0]) if sensor == "gyro" else windows.segment.of(sensor)[0]
-        by_own, weight = torch.cat([A.sum(1), by_nuisance], dim=2), _weight(e, windows.log, pool.least(sensor))
+        by_own, weight = torch.cat([A.sum(1), by_nuisance], dim=2), _weight(e, windows.log, pool.minimum(sensor))
         return _Linearised(_by_matrix(A, u) if matrix else by_own[..., :0], by_own, e, weight, windows.log)
 
     def equations(of_length: tuple[Int[Tensor, " k"], int]) -> tuple[Float[Tensor, "u u"], Float[Tensor, " u"]]:
@@ -206,7 +206,7 @@ def end_samples(first: Int[Tensor, " m"], n: int) -> Int[Tensor, "m _"]:
 
 
 def window_sets(
-    pool: Pool, window_s: Sequence[float], part: Part, most_samples: int, *, ends_only: bool = False
+    pool: Pool, window_s: Sequence[float], part: Part, max_samples: int, *, ends_only: bool = False
 ) -> list[tuple[Int[Tensor, " k"], int]]:
     """First samples of the windows of each length, and their steps; half overlapping.
 
@@ -218,7 +218,7 @@ def window_sets(
     sets = []
     for n in map(pool.samples, window_s):
         first = pool.starts(n, part, hop=max(1, n // 2), ends_only=ends_only)
-        sets.append((first[:: max(1, -(-len(first) * n // most_samples))], n))
+        sets.append((first[:: max(1, -(-len(first) * n // max_samples))], n))
     covered = torch.cat([pool.log[first] for first, _ in sets])
     missing = [name for i, name in enumerate(pool.names) if not bool((covered == i).any())]
     if missing:
@@ -245,18 +245,18 @@ def _by_log(J: Float[Tensor, "m 3 k"], log: Int[Tensor, " m"], logs: int, turns:
     return out.flatten(2)
 
 
-def _weight(e: Float[Tensor, "m 3"], log: Int[Tensor, " m"], least: Float[Tensor, " logs"]) -> Float[Tensor, " m"]:
+def _weight(e: Float[Tensor, "m 3"], log: Int[Tensor, " m"], minimum: Float[Tensor, " logs"]) -> Float[Tensor, " m"]:
     """Huber's weights, scaled so that a component of an ordinary window of its log has about unit noise, as the prior has."""
     size = e.norm(dim=1)
-    delta = HUBER_MEDIANS * median_per_log(size, log, least)[log]
+    delta = HUBER_MEDIANS * median_per_log(size, log, minimum)[log]
     weight: Tensor = huber_weight(size, delta) * 3 / delta**2 / CORRELATED
     return weight
 
 
-def median_per_log(size: Float[Tensor, " m"], log: Int[Tensor, " m"], least: Float[Tensor, " logs"]) -> Float[Tensor, " logs"]:
+def median_per_log(size: Float[Tensor, " m"], log: Int[Tensor, " m"], floor: Float[Tensor, " logs"]) -> Float[Tensor, " logs"]:
     """The median size of each log's windows, and not less than a least one.
 
     Truths differ in quality by a factor of eight between rooms of one data set.
     """
-    medians = [size[log == i].median() if bool((log == i).any()) else size.median() for i in range(len(least))]
-    return torch.maximum(torch.stack(medians), least.to(size))
+    medians = [size[log == i].median() if bool((log == i).any()) else size.median() for i in range(len(floor))]
+    return torch.maximum(torch.stack(medians), floor.to(size))

@@ -32,7 +32,7 @@ from imutool.recording import Imu, Recording
 from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import Load, Signals
-from imutool.training.calibration.log_scatter import LEAST_GAIN, widest
+from imutool.training.calibration.log_scatter import MIN_GAIN, widest
 from imutool.training.calibration.normal_equations import FOLDS, Seen, Terms, folded, linearise
 from imutool.training.calibration.shared_parameters import Problem, gain_of
 from imutool.training.fit import Epoch, note
@@ -139,9 +139,9 @@ def effects_beyond_chance(problem: Problem, effects: Sequence[LinearForm]) -> di
     gains: dict[str, float] = {}
     loss = problem.predicted([])
     while True:
-        left = [effect.name for effect in effects if effect.name not in gains]
-        tried = {name: problem.predicted(parameter_columns(effects, [*gains, name])) for name in left}
-        enough = {name: new for name, new in tried.items() if gain_of(new, loss) >= DRIFTS.get(name, LEAST_GAIN)}
+        rejected = [effect.name for effect in effects if effect.name not in gains]
+        tried = {name: problem.predicted(parameter_columns(effects, [*gains, name])) for name in rejected}
+        enough = {name: new for name, new in tried.items() if gain_of(new, loss) >= DRIFTS.get(name, MIN_GAIN)}
         helped = {name: new for name, new in enough.items() if bool((new < loss).sum() > 0.5 * len(loss))}
         agreed = {name: new for name, new in helped.items() if _beyond_chance(problem, effects, [*gains, name])}
         best = max(agreed, key=lambda name: gain_of(agreed[name], loss), default="")
@@ -166,8 +166,8 @@ def _likelier_drifts(problem: Problem, effects: Sequence[LinearForm], gains: Map
         alone, loss = (problem.predicted(parameter_columns(effects, [*names])) for names in (kept, chosen))
         for name in (effect.name for effect in effects if effect.name in DRIFTS and effect.name not in gains):
             new = problem.predicted(parameter_columns(effects, [*kept, name]))
-            least, most = (-LEAST_GAIN, 0.0) if name in temperature.EFFECTS else (LEAST_GAIN, 0.5 * len(loss))
-            better = gain_of(new, loss) >= least and bool((new < loss).sum() > most)
+            minimum, maximum = (-MIN_GAIN, 0.0) if name in temperature.EFFECTS else (MIN_GAIN, 0.5 * len(loss))
+            better = gain_of(new, loss) >= minimum and bool((new < loss).sum() > maximum)
             if better and gain_of(new, alone) >= DRIFTS[name] and _beyond_chance(problem, effects, [*kept, name]):
                 chosen, loss = kept | {name: gain_of(new, alone)}, new
     return chosen

@@ -14,8 +14,8 @@ from imutool.training.training_windows import Pool
 
 VEHICLE_M2_S = 1.0  # density of velocity above which the filter's usual bound is not believed
 SPEED_WINDOWS_S = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
-LEAST_TURN_ERROR = 1e-3  # left-out logs of TUM-VI are worse with less, others hardly better
-MOST_TURN_ERROR = FilterSettings().gyro_scale  # and worse with more, for the errors of blocks are not independent
+MIN_TURN_ERROR = 1e-3  # left-out logs of TUM-VI are worse with less, others hardly better
+MAX_TURN_ERROR = FilterSettings().gyro_scale  # and worse with more, for the errors of blocks are not independent
 AT_ONCE = 1 << 14  # samples: roots take some hundred bytes each
 
 
@@ -65,4 +65,4 @@ def _turn_error(model: BiasModel, pool: Pool) -> dict[str, float]:
         error -= float(np.sum(np.square(total)) / len(rows))
         turned += len(rows) * float(pool.gyro[rows].var(dim=0, correction=0).sum())
     share = math.sqrt(max(error, 0.0) / turned) if turned > 0.0 else math.inf
-    return {"turn_error": min(max(share, LEAST_TURN_ERROR), MOST_TURN_ERROR)}
+    return {"turn_error": min(max(share, MIN_TURN_ERROR), MAX_TURN_ERROR)}

@@ -19,7 +19,7 @@ from torch import Tensor
 from imutool.array_types import Float
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.training.calibration.closed_form import W_PRIOR
-from imutool.training.calibration.log_scatter import LEAST_GAIN, SURELY
+from imutool.training.calibration.log_scatter import MIN_GAIN, SURELY
 from imutool.training.calibration.normal_equations import Seen, Terms, linearise
 from imutool.training.calibration.shared_parameters import TINY
 from imutool.training.training_windows import Pool
@@ -72,4 +72,4 @@ def _is_surely_less(new: Float[Tensor, " logs"], loss: Float[Tensor, " logs"]) -
     if len(gain) < 2:
         return False
     surely = float(stdtrit(len(gain) - 1, ndtr(SURELY)))
-    return bool(gain.mean() > max(LEAST_GAIN, surely * float(gain.std()) / len(gain) ** 0.5))
+    return bool(gain.mean() > max(MIN_GAIN, surely * float(gain.std()) / len(gain) ** 0.5))

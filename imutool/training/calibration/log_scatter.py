@@ -27,8 +27,8 @@ NUISANCE_STD = {  # how far they differ from log to log, at most
 ROTATION = {"gyro": slice(3, 6), "accel": slice(5, 8)}  # of a log's unknowns, of which the rest bias comes first
 CLOCK, LEVER = {"gyro": slice(6, 7), "accel": slice(8, 9)}, {"gyro": slice(7, 7), "accel": slice(9, 12)}
 NARROWER = np.geomspace(1.0, 20.0, 13)  # shares of these widths that logs may show, as divisors
-LEAST_GAIN, SURELY = 0.03, 2.0  # share of the error, and standard errors over logs, by which more parameters have to be better
-USUAL_SQUARES, LEAST_VARIANCE = 4.0, 1e-10  # of differences between logs; of a combination of parameters, in units of the prior
+MIN_GAIN, SURELY = 0.03, 2.0  # share of the error, and standard errors over logs, by which more parameters have to be better
+USUAL_SQUARES, MIN_VARIANCE = 4.0, 1e-10  # of differences between logs; of a combination of parameters, in units of the prior
 
 
 def widest(sensor: Sensor, like: Tensor) -> Float[Tensor, " o"]:
@@ -106,7 +106,7 @@ def shared_by_scatter(
         C, D = (root[:, None] * each * root for each in (C, D))
         variance, V = torch.linalg.eigh(C + D - C @ D - D @ C)
         square = (V.mT @ (root[:, None] * step))[..., 0].square() / variance
-        shown, share = variance > LEAST_VARIANCE, 1.0 - 1.0 / len(logs.S)
+        shown, share = variance > MIN_VARIANCE, 1.0 - 1.0 / len(logs.S)
         size = (USUAL_SQUARES + share * float(square[shown].sum())) / (USUAL_SQUARES - 2.0 + share * int(shown.sum()))
     covariance = torch.linalg.inv(P + S / size) if len(theta) else S
     return theta - covariance @ (prior * theta + v / size), covariance
@@ -123,7 +123,7 @@ class LogPieces(NamedTuple):
         """Pieces of logs, from the log and the time of each sample."""
         began, ended = (torch.stack([edge(t[log == i]) for i in range(logs)]) for edge in (torch.amin, torch.amax))
         count = ((ended - began) / PIECE_S).ceil().clamp_min(1.0).long()
-        share = (t - began[log]) / (ended - began).clamp_min(LEAST_VARIANCE)[log]
+        share = (t - began[log]) / (ended - began).clamp_min(MIN_VARIANCE)[log]
         before = torch.cumsum(count, 0) - count
         piece = before[log] + (share * count[log]).long().clamp_max(count[log] - 1)
         return cls(piece, torch.repeat_interleave(torch.arange(logs).to(log), count))

@@ -37,7 +37,7 @@ FREE: Mapping[Sensor, int] = {"gyro": 3, "accel": 5}  # a log's own unknowns tha
 MAX_SAMPLES, CHUNK, PIECE = 150_000, 20_000, 128  # samples of one window length, at a time, and steps of a piece
 REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of made-up logs without effects
 SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
-SETTLED, MOST_STEPS = 0.2, 40  # deviations by which a step moves a parameter at most; steps with windows of all lengths
+SETTLED, MAX_STEPS = 0.2, 40  # deviations by which a step moves a parameter at most; steps with windows of all lengths
 WEAK = 0.01  # of a prior's precision, that of the prior at first
 FOLDS = 3  # parts of a log where there are fewer logs than this
 
@@ -112,9 +112,9 @@ def linearise(seen: Seen, terms: Terms, part: Part, own_prior: Float[Tensor, " o
     samples, split = seen.pool.of_sensor(seen.sensor), LogPieces.of(seen.pool.log, seen.pool.t, logs)
     rows, unknowns = [pieces.row(windows.first, windows.n) for windows in sets], len(prior) + len(width)
     nothing = Equations(*(prior.new_zeros(len(split.log), *shape) for shape in ((unknowns, unknowns), (unknowns,), ())))
-    for step in range(len(sets) + MOST_STEPS):
+    for step in range(len(sets) + MAX_STEPS):
         fit = judged = nothing
-        size = seen.pool.least(seen.sensor)
+        size = seen.pool.minimum(seen.sensor)
         true_u = samples - terms.values @ torch.einsum("iqp,p->qi", terms.pattern, theta) - own[seen.pool.log, :3]
         prefix = _prefix(seen, pieces, terms, true_u, turned)
         for windows, row in list(zip(sets, rows, strict=True))[: step + 1]:
@@ -124,8 +124,8 @@ def linearise(seen: Seen, terms: Terms, part: Part, own_prior: Float[Tensor, " o
         fit, judged = (Equations(*split.merged(some.H, some.g, some.c, seen.sensor, len(prior))) for some in (fit, judged))
         if own_prior is None and step >= len(sets) - 1:
             width = shown_by_logs(seen.sensor, fit.H, fit.g, theta, own, prior)
-        held = prior * (1.0 if step >= len(sets) else WEAK)
-        problem = Problem(theta, own, held, width, design_effect(seen.pool), FREE[seen.sensor], fit, judged)
+        penalty = prior * (1.0 if step >= len(sets) else WEAK)
+        problem = Problem(theta, own, penalty, width, design_effect(seen.pool), FREE[seen.sensor], fit, judged)
         if step > len(sets) and settled:
             break
         to, covariance = problem.solve(range(len(prior)))

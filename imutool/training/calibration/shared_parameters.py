@@ -135,14 +135,14 @@ class Problem:
         of_others: Callable[[int], Solution] = partial(self._solved, columns, *self._eliminated(columns))
         if by_scatter:
             of_others = partial(self._solved_by_scatter, columns, *self._integrated(columns))
-        held = torch.where(torch.arange(len(self.own_prior)).to(self.prior) < self.free, 0.0, self.own_prior)
+        penalty = torch.where(torch.arange(len(self.own_prior)).to(self.prior) < self.free, 0.0, self.own_prior)
         for i, at in enumerate(self.own):
             theta = (self.alone(i).solve(columns) if by_itself else of_others(i)).theta
             judged = self.judged.of([i]).moved(theta - self.theta)
-            H, g = judged.H[0, p:, p:] + torch.diag(held), judged.g[0, p:] + held * at
-            least = RIDGE * H.diagonal().mean().clamp_min(RIDGE)
-            own = -torch.linalg.solve(H + least * torch.eye(len(g)).to(H), g)
-            losses.append(judged.c[0] + held @ at.square() + 2 * g @ own + own @ H @ own)
+            H, g = judged.H[0, p:, p:] + torch.diag(penalty), judged.g[0, p:] + penalty * at
+            minimum = RIDGE * H.diagonal().mean().clamp_min(RIDGE)
+            own = -torch.linalg.solve(H + minimum * torch.eye(len(g)).to(H), g)
+            losses.append(judged.c[0] + penalty @ at.square() + 2 * g @ own + own @ H @ own)
         return torch.stack(losses)
 
     def _of(self, logs: Sequence[int], factor: float = 1.0) -> Problem:

@@ -90,9 +90,9 @@ class IncrementObjective(Objective):
         first = first[:: max(1, -(-len(first) * self.stretch // USUAL_SAMPLES))]
         first = torch.cat([first, *(torch.nonzero(whole)[:1, 0] for whole in self.whole.values())])  # one of each length
         parts = [self.errors(some) for some in torch.split(first, USUAL_BATCH)]
-        least = self.pool.least(self.sensor)
+        minimum = self.pool.minimum(self.sensor)
         joined = {n: [torch.cat(column) for column in zip(*(part[n] for part in parts), strict=True)] for n in self.lengths}
-        return {n: median_per_log(size, log, least) for n, (size, log) in joined.items()}
+        return {n: median_per_log(size, log, minimum) for n, (size, log) in joined.items()}
 
     def terms(self, generator: torch.Generator) -> Sequence[Callable[[], Float[Tensor, ""]]]:
         """One function for the sum of all lengths, each the mean over a few stretches, drawn from all logs alike."""

@@ -218,7 +218,7 @@ class WindowEndObjective(Objective):
         for n, first in self.pools:
             some = first[:: max(1, -(-len(first) * n // USUAL_SAMPLES))]
             size = torch.cat(of_each(partial(self.errors, n=n), torch.split(some, max(1, BATCH_SAMPLES // n))))
-            usual[n] = median_per_log(size, self.pool.log[some], self.pool.least(self.sensor))
+            usual[n] = median_per_log(size, self.pool.log[some], self.pool.minimum(self.sensor))
         return usual
 
     def terms(self, generator: torch.Generator) -> Sequence[Callable[[], Float[Tensor, ""]]]:

@@ -27,7 +27,7 @@ STRIP_BINS = 400
 WELCH_S = 8.0  # longest window; shorter for short unseen stretches
 MIN_SAMPLES = 32  # samples in a window, below which there is no spectrum
 BINS = 16
-LEAST_BLOCKS = 3  # in a bin
+MIN_BLOCKS = 3  # in a bin
 BLOCK_S = 0.5  # one independent value each: the misfit of a motion lasts about this long
 GAP_PERIODS = 1.5  # sample periods without a sample that end a stretch
 
@@ -75,8 +75,8 @@ def residual(trace: Traces, *, found: bool) -> str:
         sides = [(residual_in_band(trace, expected), color) for expected, color in both]
         for column, (signal, part) in enumerate(compared.items()):
             for row, axes in enumerate(panels[:, column]):
-                for left, color in sides:
-                    axes.plot(*decimate_extremes(trace.t_s, left[:, part][:, row], BUCKETS), color=color, lw=0.6)
+                for values, color in sides:
+                    axes.plot(*decimate_extremes(trace.t_s, values[:, part][:, row], BUCKETS), color=color, lw=0.6)
                 for first, last in true_intervals(trace.t_s, trace.held_out):
                     axes.axvspan(first, last, color=HELD, alpha=0.15, lw=0)
                 axes.set_ylabel(f"{AXES[row]} ({UNITS[signal]})")
@@ -186,11 +186,11 @@ def intervals_in_log(trace: Traces, located: Located) -> Iterator[tuple[float, f
 
 def residual_in_band(trace: Traces, expected: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
     """Residual below the frequency up to which the expected signal is known."""
-    left: Float64[np.ndarray, "n 6"] = trace.real - expected
+    residual: Float64[np.ndarray, "n 6"] = trace.real - expected
     if trace.band_hz is None:
-        return np.asarray(left)
+        return np.asarray(residual)
     taps = Band.below(trace.band_hz, rate_hz(trace)).taps
-    return np.asarray(fftconvolve(left, taps[:, None], mode="same", axes=0))
+    return np.asarray(fftconvolve(residual, taps[:, None], mode="same", axes=0))
 
 
 def held_out_mask(trace: Traces) -> Bool[np.ndarray, " n"]:
@@ -236,12 +236,12 @@ def _density(traces: Sequence[Traces], part: slice, after: bool) -> tuple[Line, 
 
 def _stretches(trace: Traces, part: slice, after: bool) -> Iterator[Float64[np.ndarray, "m 3"]]:
     """Residual over unseen time, split where samples are missing."""
-    left = (trace.real - (trace.after if after else trace.before))[:, part]
-    rows = np.flatnonzero(held_out_mask(trace) & np.isfinite(left).all(axis=1))
+    residual = (trace.real - (trace.after if after else trace.before))[:, part]
+    rows = np.flatnonzero(held_out_mask(trace) & np.isfinite(residual).all(axis=1))
     steps = np.diff(trace.t_s[rows]) > GAP_PERIODS / rate_hz(trace)
     for piece in np.split(rows, np.flatnonzero(steps) + 1):
         if len(piece) >= MIN_SAMPLES:
-            yield left[piece]
+            yield residual[piece]
 
 
 def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: dict[str, str], name: str) -> str | None:
@@ -259,8 +259,10 @@ def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: d
             for axis, axes in enumerate(panels[row]):
                 x = np.concatenate([variable(trace, signal, axis)[held_out_mask(trace)] for trace in d.traces])
                 blocks = np.concatenate([_blocks(trace, k)[held_out_mask(trace)] for k, trace in enumerate(d.traces)])
-                for left, color in sides:
-                    y = np.concatenate([one[held_out_mask(t), part][:, axis] for one, t in zip(left, d.traces, strict=True)])
+                for values, color in sides:
+                    y = np.concatenate(
+                        [residual[held_out_mask(t), part][:, axis] for residual, t in zip(values, d.traces, strict=True)]
+                    )
                     centre, mean, band = means(x, y, blocks)
                     axes.fill_between(centre, mean - band, mean + band, color=color, alpha=0.25, lw=0)
                     axes.plot(centre, mean, color=color, lw=1.2, marker="o", ms=2.5)
@@ -284,11 +286,11 @@ def means(x: Line, y: Line, blocks: Float64[np.ndarray, " n"]) -> tuple[Decimate
     bins = np.searchsorted(edges, x, side="right") - 1
     rows = []
     for k in range(BINS):
-        here = bins == k
-        owner = np.unique(blocks[here], return_inverse=True)[1]
-        if here.any() and owner.max() + 1 >= LEAST_BLOCKS:
-            apart = np.bincount(owner, y[here] - y[here].mean())  # summed in a block, errors that go together count together
-            rows.append((edges[k : k + 2].mean(), y[here].mean(), 2.0 * np.linalg.norm(apart) / len(owner)))
+        in_bin = bins == k
+        owner = np.unique(blocks[in_bin], return_inverse=True)[1]
+        if in_bin.any() and owner.max() + 1 >= MIN_BLOCKS:
+            sums = np.bincount(owner, y[in_bin] - y[in_bin].mean())  # summed in a block, errors that go together count together
+            rows.append((edges[k : k + 2].mean(), y[in_bin].mean(), 2.0 * np.linalg.norm(sums) / len(owner)))
     centre, mean, band = np.array(rows).reshape(-1, 3).T
     return centre, mean, band
 

@@ -148,7 +148,7 @@ def _locations(d: Diagnosis) -> Iterator[str]:
         yield _figure(figures.misfit_strip(d, trace), f"w{k}", caption)
 
 
-def _closed(first: Diagnosis, again: Diagnosis) -> Diagnosis:
+def _closed(first: Diagnosis, second: Diagnosis) -> Diagnosis:
     """The first findings with samples of both: expected by the first simulation before, and by the second after.
 
     The ideal sensor is that of the first: samples of the second have the bias of physics.toml.
@@ -157,7 +157,7 @@ def _closed(first: Diagnosis, again: Diagnosis) -> Diagnosis:
     t_s, expected = (np.concatenate([getattr(trace, name) for trace in first.traces]) for name in ("t_s", "before"))
     ideals = [trace.ideal for trace in first.traces if trace.ideal is not None]
     ideal = np.concatenate(ideals) if len(ideals) == len(first.traces) else None
-    for after in again.traces:
+    for after in second.traces:
         of_before, of_after = np.isin(t_s, after.t_s), np.isin(after.t_s, t_s)
         if not of_after.any():
             continue
@@ -173,7 +173,7 @@ def _closed(first: Diagnosis, again: Diagnosis) -> Diagnosis:
                 ideal=None if ideal is None else ideal[of_before],
             )
         )
-    return replace(again, traces=tuple(traces), findings=first.findings, signals={})
+    return replace(second, traces=tuple(traces), findings=first.findings, signals={})
 
 
 def _before_and_after(d: Diagnosis) -> Iterator[str]:
@@ -240,8 +240,8 @@ def _left(d: Diagnosis) -> Iterator[str]:
         yield f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
     if d.closer and d.findings:
         yield f"<h2>Improvement</h2><p class=note>{text(gain_source(d) + held_out_time(d))}.</p><dl>"
-        for signal, again in d.closer.items():
-            yield f"<dt>{text(signal)}</dt><dd>{text(improvement(again))}</dd>"
+        for signal, second in d.closer.items():
+            yield f"<dt>{text(signal)}</dt><dd>{text(improvement(second))}</dd>"
         yield "</dl>"
 
 

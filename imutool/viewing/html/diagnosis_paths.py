@@ -20,7 +20,7 @@ from imutool.viewing.html.diagnosis_figures import GAP_PERIODS, held_out_mask, r
 from imutool.viewing.html.drawing import svg
 from imutool.viewing.html.page import AFTER, BEFORE, INK
 
-LEAST_S, MOST_S = 2.0, 10.0  # of a stretch; a longer one is cut
+MIN_S, MAX_S = 2.0, 10.0  # of a stretch; a longer one is cut
 GRID_S = 0.05  # of the drift's clock
 
 
@@ -39,9 +39,9 @@ def held_out_stretches(trace: Traces) -> Iterator[Stretch]:
     rows = np.flatnonzero(held_out_mask(trace) & np.isfinite(trace.ideal).all(axis=1))
     breaks = np.flatnonzero(np.diff(trace.t_s[rows]) > GAP_PERIODS / rate_hz(trace)) + 1
     for piece in np.split(rows, breaks):
-        count = max(1, int(np.ceil(len(piece) / (MOST_S * rate_hz(trace)))))
+        count = max(1, int(np.ceil(len(piece) / (MAX_S * rate_hz(trace)))))
         for part in np.array_split(piece, count):
-            if len(part) >= LEAST_S * rate_hz(trace):
+            if len(part) >= MIN_S * rate_hz(trace):
                 yield _stretch(trace, slice(int(part[0]), int(part[-1]) + 1))
 
 
@@ -103,5 +103,5 @@ def _stretch(trace: Traces, rows: slice) -> Stretch:
 def _errors(truth: Poses, path: Poses) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     turn, true = (Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) for poses in (path, truth))
     angle: Float64[np.ndarray, " n"] = np.degrees((true.inv() * turn).magnitude())
-    apart: Float64[np.ndarray, " n"] = np.linalg.norm(path.p_wb - truth.p_wb, axis=1)
-    return angle, apart
+    distance: Float64[np.ndarray, " n"] = np.linalg.norm(path.p_wb - truth.p_wb, axis=1)
+    return angle, distance

@@ -135,8 +135,8 @@ def _limits(axes: Any, values: Sequence[Line], *, signed: bool, log: bool) -> No
         axes.set_ylim(min(tops) * 10.0**-DECADES, max(tops) * 2.0)
     elif signed:
         axes.axhline(0.0, color=INK, lw=0.6)
-        most = max((top for top in tops if top <= LINEAR_RATIO * min(tops)), default=0.0)
-        axes.set_ylim(-1.15 * most, 1.15 * most) if most > 0.0 else None
+        maximum = max((top for top in tops if top <= LINEAR_RATIO * min(tops)), default=0.0)
+        axes.set_ylim(-1.15 * maximum, 1.15 * maximum) if maximum > 0.0 else None
         at_least_three_ticks(axes)
     else:
         axes.set_ylim(0.0, 1.1 * max(tops, default=1.0) or 1.0)
@@ -208,14 +208,14 @@ def _longest(events: Sequence[Event]) -> list[Event]:
 
 def _draw_lanes(figure: Any, *, data: RunData, kinds: Sequence[str]) -> None:
     axes = figure.subplots()
-    least_s = MIN_EVENT_SHARE * data.duration_s
+    min_s = MIN_EVENT_SHARE * data.duration_s
     for lane, kind in enumerate(kinds):
         spans = [data.elapsed_s(np.array([e.start_ns, e.end_ns])) for e in data.events if e.kind == kind]
         color, label = EVENT_COLORS.get(kind, MARK), f"{event_label(kind)}: {len(spans)}"
-        bars = [(first, last - first) for first, last in spans if last - first >= least_s]
+        bars = [(first, last - first) for first, last in spans if last - first >= min_s]
         axes.broken_barh(bars, (-lane - 0.4, 0.8), color=color, lw=0, label=label)
         # a thin low mark: wide ones, many in a row, would look like one long event
-        moments = [first for first, last in spans if last - first < least_s]
+        moments = [first for first, last in spans if last - first < min_s]
         axes.vlines(moments, -lane - 0.4, -lane + 0.1, color=color, lw=MOMENT_POINTS, label=label)
     axes.set_yticks([-lane for lane in range(len(kinds))], [event_label(kind) for kind in kinds])
     axes.tick_params(axis="y", length=0)

@@ -80,8 +80,8 @@ def error_map(data: RunData) -> Picture | None:
     panels = []
     for kind, (error, unit) in kinds.items():
         title = f"{kind} error, at most {format_quantity(float(np.nanmax(error)), unit)}"
-        most = np.fmax.reduceat(error, starts)  # of each step
-        draw = partial(_draw_heat, points=points, whole=whole, error=most, title=title, unit=unit)
+        maximum = np.fmax.reduceat(error, starts)  # of each step
+        draw = partial(_draw_heat, points=points, whole=whole, error=maximum, title=title, unit=unit)
         panels.append(Panel(draw, HEIGHT_INCH, f"{kind} error of {trace.name} along the path from above, in colours"))
     whose = f"Path of {run_name(trace)}" if fits else "The true path"
     caption = f"{whose} from above, coloured by the error of {run_name(trace)}."
@@ -126,8 +126,8 @@ def _draw_heat(
     axes.plot(*_pieces(points, whole), color=HELD, lw=0.6)  # where the truth is unknown
     colors = [LEVELS[round(k * (len(LEVELS) - 1) / max(len(edges) - 2, 1))] for k in range(len(edges) - 1)]
     for k, color in enumerate(colors):
-        here = (level == k) & np.isfinite(error) & whole
-        x, y = _pieces(points, here)
+        of_level = (level == k) & np.isfinite(error) & whole
+        x, y = _pieces(points, of_level)
         axes.plot(x, y, color=color, lw=2.2, label=f"{edges[k]:g} to {edges[k + 1]:g} {unit}", solid_capstyle="round")
     _equal(axes, points[:, :2], MIN_EXTENT_M)
     axes.set(xlabel="x (m)", ylabel="y (m)")
@@ -139,9 +139,9 @@ def _draw_heat(
     bar.ax.grid(visible=False)
 
 
-def _pieces(points: Points, here: Any) -> tuple[Any, Any]:
-    """Steps that begin where `here` holds, as one line with holes."""
-    starts = np.flatnonzero(here[:-1])
+def _pieces(points: Points, selected: Any) -> tuple[Any, Any]:
+    """Steps that begin where `selected` holds, as one line with holes."""
+    starts = np.flatnonzero(selected[:-1])
     if not len(starts):
         return np.zeros(0), np.zeros(0)
     keep = np.unique(np.concatenate([starts, starts + 1]))
@@ -165,10 +165,10 @@ def _unit_of(extent_m: float) -> tuple[float, str]:
     return (1e-3, "km") if extent_m >= KILOMETRES_M else (1.0, "m")
 
 
-def _equal(axes: Any, box: Float64[np.ndarray, "_ 2"], least: float) -> None:
+def _equal(axes: Any, box: Float64[np.ndarray, "_ 2"], minimum: float) -> None:
     """Axis limits around a box with equal scales."""
     low, high = np.nanmin(box, axis=0), np.nanmax(box, axis=0)
-    middle, half = (low + high) / 2.0, np.maximum((high - low) * (0.5 + MARGIN), least / 2.0)
+    middle, half = (low + high) / 2.0, np.maximum((high - low) * (0.5 + MARGIN), minimum / 2.0)
     half = np.maximum(half, half[::-1] * [ASPECT, 1.0 / ASPECT])  # to the aspect of the panel
     axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
@@ -197,8 +197,8 @@ def _extent(points: Points) -> float:
 def _near(data: RunData) -> tuple[list[Trace], list[Trace]]:
     """Runs whose paths fit the picture, and runs that leave it."""
     points = _reference(data)
-    centre, most = points.mean(axis=0), FAR * max(_extent(points), MIN_EXTENT_M)
-    fits = [bool(np.abs(trace.path.p_wb - centre).max() <= most) for trace in data.traces]
+    centre, maximum = points.mean(axis=0), FAR * max(_extent(points), MIN_EXTENT_M)
+    fits = [bool(np.abs(trace.path.p_wb - centre).max() <= maximum) for trace in data.traces]
     near = [trace for trace, fit in zip(data.traces, fits, strict=True) if fit]
     return near, [trace for trace, fit in zip(data.traces, fits, strict=True) if not fit]
 

@@ -156,13 +156,13 @@ def finding_events(folder: Path, log: str, start_ns: int, end_ns: int) -> tuple[
     first = diagnosis.real[0] if diagnosis.real else "no log"
     path, log = log, Path(log).name
     own = log, Path(log).stem  # of a recording of arrays a diagnosis holds the name
-    here = [place for place in diagnosis.located if Path(place.log or first).name in own]
+    places = [place for place in diagnosis.located if Path(place.log or first).name in own]
     if path in diagnosis.real:
-        here = [place for place in here if (place.log or first) == path]
-    if Path(first).name not in own and not here:
+        places = [place for place in places if (place.log or first) == path]
+    if Path(first).name not in own and not places:
         return [], [f"The findings of {folder.name} are on the clock of {Path(first).name} and are not marked in {log}."]
     events, notes = [], []
-    for place in here:
+    for place in places:
         text = _words(place, diagnosis.findings)
         longest = sorted(place.intervals_s, key=lambda interval: interval[0] - interval[1])
         if len(longest) > MAX_EVENTS_PER_KIND:

@@ -85,8 +85,8 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
     survey = examine(lambda: _blocks(messages[topic]), truth_of(rest), CleaningSettings(), where=str(path), topic=topic)
     samples, logged, why = _sound_samples(messages[topic], survey, where)
     if why:
-        left = f"{survey.messages - survey.valid} of {survey.messages} messages are left out"
-        notes.append(f"{topic} cannot be shown as it was recorded ({why}); as by debias --clean, {left}.")
+        text = f"{survey.messages - survey.valid} of {survey.messages} messages are left out"
+        notes.append(f"{topic} cannot be shown as it was recorded ({why}); as by debias --clean, {text}.")
     notes += [f"{topic}: {warning}." for warning in jump_warnings(clock_jumps(samples.t_ns))]
     if survey.reasons:
         notes.append(f"{topic} cannot be trusted: {'; '.join(survey.reasons)}.")
@@ -149,9 +149,9 @@ def _whole(batches: list[ImuBatch]) -> ImuBatch:
     """Messages of an IMU as whole columns, which the samples share; the list is emptied."""
     none, frame_id = np.zeros(0, np.int64), batches[0].frame_id if batches else ""
     batches.append(ImuBatch(none, none, none.astype(np.uint32), none, np.zeros((0, 3)), np.zeros((0, 3)), ""))
-    apart = [list(column) for column in list(zip(*batches, strict=True))[:-1]]
+    columns_of_batches = [list(column) for column in list(zip(*batches, strict=True))[:-1]]
     batches.clear()
-    columns = [joined_column(apart.pop(0)) for _ in range(len(apart))]
+    columns = [joined_column(columns_of_batches.pop(0)) for _ in range(len(columns_of_batches))]
     for column in columns:  # so that the samples need no copy
         column.flags.writeable = False
     return ImuBatch._make([*columns, frame_id])

@@ -247,16 +247,16 @@ MAX_PATH_ROWS = 20_000  # of a path: a screen has no more pixels along it
 Rows = Int64[np.ndarray, " m"]
 
 
-def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MAX_CURVE_ROWS) -> Rows:
-    """Decimate a curve to `most` rows: per bucket the lowest and highest of every column.
+def curve_rows(values: Float64[np.ndarray, "n k"], maximum: int = MAX_CURVE_ROWS) -> Rows:
+    """Decimate a curve to `maximum` rows: per bucket the lowest and highest of every column.
 
     The first and the last row are always drawn, and of a bucket with NaN rows one such row, so that a hole stays a hole.
-    `most` is at least 2 k + 3.
+    `maximum` is at least 2 k + 3.
     """
     n, columns = values.shape
-    if n <= most:
+    if n <= maximum:
         return np.arange(n)
-    buckets = max(1, (most - 2) // (2 * columns + 1))
+    buckets = max(1, (maximum - 2) // (2 * columns + 1))
     size = -(-n // buckets)
     starts = np.arange(0, n, size)
     drawn, holes = np.zeros(len(starts) * size, dtype=bool), np.zeros((len(starts), size), dtype=bool)
@@ -266,31 +266,31 @@ def curve_rows(values: Float64[np.ndarray, "n k"], most: int = MAX_CURVE_ROWS) -
         cut[:n] = column
         cut = cut.reshape(-1, size)
         hole = np.isnan(cut)
-        for extreme, least in ((np.inf, np.argmin), (-np.inf, np.argmax)):
+        for extreme, minimum in ((np.inf, np.argmin), (-np.inf, np.argmax)):
             cut[hole] = extreme
-            drawn[starts + least(cut, axis=1)] = True
+            drawn[starts + minimum(cut, axis=1)] = True
         holes |= hole
     drawn[(starts + holes.argmax(axis=1))[np.any(holes, axis=1)]] = True
     rows: Rows = np.flatnonzero(drawn[:n])
     return rows
 
 
-def path_rows(p_wb: Float64[np.ndarray, "n 3"], most: int = MAX_PATH_ROWS) -> Rows:
-    """Decimate a path to at most `most` rows: half even in time, half even along the path.
+def path_rows(p_wb: Float64[np.ndarray, "n 3"], maximum: int = MAX_PATH_ROWS) -> Rows:
+    """Decimate a path to at most `maximum` rows: half even in time, half even along the path.
 
     A row left out follows a drawn one by less than 2 / (most - 2) of the path's length and of its rows: a fast part keeps its
     shape, and so does a small part of a path that left for kilometres. The first and the last row are always drawn.
     """
     n = len(p_wb)
-    if n <= most:
+    if n <= maximum:
         return np.arange(n)
     edges = range(0, n - 1, quaternion.ROWS_AT_ONCE)
     steps = [quaternion.length(np.diff(p_wb[first : first + quaternion.ROWS_AT_ONCE + 1], axis=0)) for first in edges]
     travelled = np.cumsum(np.concatenate([[0.0], *steps]))
-    half = most // 2
+    half = maximum // 2
     finite = np.isfinite(travelled[-1])  # squares of absurd positions overflow: then all rows are even in time
     along = np.searchsorted(travelled, np.linspace(0.0, travelled[-1], half)) if finite else np.zeros(0, np.int64)
-    rows: Rows = np.unique(np.concatenate([np.linspace(0, n - 1, most - half).round().astype(np.int64), along]))
+    rows: Rows = np.unique(np.concatenate([np.linspace(0, n - 1, maximum - half).round().astype(np.int64), along]))
     return rows
 
 

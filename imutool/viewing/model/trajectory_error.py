@@ -98,7 +98,7 @@ def row_of_largest(values: Float64[np.ndarray, " n"]) -> int | None:
 
 def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Errors:
     """Error of an estimate against the truth at the same stamps; NaN where `valid` is false."""
-    turned, roll_pitch_yaw, apart = (np.empty((len(truth), 3)) for _ in range(3))
+    turned, roll_pitch_yaw, distance = (np.empty((len(truth), 3)) for _ in range(3))
     unknown = 0.0 if truth.has_positions else np.nan
     for first in range(0, len(truth), quaternion.ROWS_AT_ONCE):
         rows = slice(first, first + quaternion.ROWS_AT_ONCE)
@@ -106,8 +106,8 @@ def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Erro
         hole = np.where(valid[rows], 0.0, np.nan)[:, None]
         turned[rows] = np.rad2deg(quaternion.log(quaternion.multiply(back, q))) + hole
         roll_pitch_yaw[rows] = np.rad2deg(quaternion.roll_pitch_yaw(quaternion.multiply(q, back))) + hole
-        apart[rows] = estimate.p_wb[rows] - truth.p_wb[rows] + (hole + unknown)
-    return Errors(estimate.t_ns, turned, roll_pitch_yaw, apart)
+        distance[rows] = estimate.p_wb[rows] - truth.p_wb[rows] + (hole + unknown)
+    return Errors(estimate.t_ns, turned, roll_pitch_yaw, distance)
 
 
 class RigidMotion(NamedTuple):

@@ -83,17 +83,17 @@ def fleet_blueprint() -> rrb.Blueprint:
 
 def _log_view(data: RunData, scope: Scope, source: bool) -> rrb.Horizontal:
     """One log: paths and total errors on the left, tabs on the right."""
-    left: list[Any] = [paths_view(data, scope)]
+    views: list[Any] = [paths_view(data, scope)]
     shares = [ROW_SHARES["paths"]]
     if error_scale_top(data) is not None:
-        left.append(_legend(scope))
+        views.append(_legend(scope))
         shares.append(ROW_SHARES["legend"])
     curves = tabs.total_errors(data, scope)
-    left += curves
+    views += curves
     shares += [ROW_SHARES["error"]] * len(curves)
     right = rrb.Tabs(*tabs.tabs(data, scope, source), active_tab=0)
     return rrb.Horizontal(
-        rrb.Vertical(*left, row_shares=shares), right, column_shares=[1, 1], name=scope[-1] if scope else None
+        rrb.Vertical(*views, row_shares=shares), right, column_shares=[1, 1], name=scope[-1] if scope else None
     )
 
 

@@ -139,7 +139,7 @@ class Live:
         if self._file is None:
             return False
         if not is_complete_rrd(path):
-            self.shown = [one for one in self.shown if one.how != "rrd"]
+            self.shown = [output for output in self.shown if output.how != "rrd"]
             logger.warning("The .rrd file could not be written completely, perhaps because the disk is full; it was removed")
             return False
         return True
@@ -179,7 +179,7 @@ class Live:
     def _drop_viewer(self, why: str) -> None:
         """Drops the viewer and warns once."""
         if self._viewer is not None:
-            self.shown = [one for one in self.shown if one.how == "rrd"]
+            self.shown = [output for output in self.shown if output.how == "rrd"]
         self._viewer = None
         logger.warning("%s; debiasing goes on without it", why)
 

@@ -13,7 +13,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec.decode import decode_imu
 
 CDR = b"\0\1\0\0"  # how a little-endian message begins; no JSON does
-MOST_NS = 1 << 62  # of a stamp, 146 years: the step between any two fits into int64
+MAX_NS = 1 << 62  # of a stamp, 146 years: the step between any two fits into int64
 
 Vector = tuple[float, float, float]
 
@@ -96,7 +96,7 @@ def sample(text: bytes | str, arrival_s: float) -> Sample:
         raise ValueError("neither gyro and accel nor a sensor_msgs/Imu")
     if stamp_ns is None:
         raise ValueError("no time: t_ns, t_s or header.stamp")
-    if abs(stamp_ns) > MOST_NS:
+    if abs(stamp_ns) > MAX_NS:
         raise ValueError("a time more than 146 years from 1970")
     return Sample(stamp_ns, gyro, accel, arrival_s, message.temperature)
 

@@ -28,14 +28,14 @@ from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording.columns import clock_jumps, jump_warnings
 from imutool.units import SENSORS
 from imutool.viewing.stream import Delay, StreamStatistics
-from imutool.viewing.stream.samples import MOST_NS, Malformed, Sample
+from imutool.viewing.stream.samples import MAX_NS, Malformed, Sample
 from imutool.viewing.stream.sources import Samples, timely
 from imutool.viewing.stream.stream_fit import STREAM, SWITCH_S, StreamFit, at_rate_of, imu_of
 
 START_S = 2.0  # of the stream, from which the initial bias is taken
 BATCH_S = 0.1  # shown together
 MAX_WAITING = 2048  # batches, 3 minutes of a stream and some 100 MB at 1 kHz: of more that nobody draws, some are lost
-MOST_FIRST = 1 << 16  # samples before the start, where the clock jumps again and again
+MAX_FIRST = 1 << 16  # samples before the start, where the clock jumps again and again
 MAX_DELAYS = 1 << 20  # of which percentiles are taken: 17 minutes at 1 kHz, then a random choice
 
 logger = logging.getLogger("imutool")
@@ -105,7 +105,7 @@ class _Session:
             self._stretches.append(len(self._first))
         self._first.append(found)
         seconds = abs(found.stamp_ns - self._first[self._stretches[-1]].stamp_ns) * 1e-9
-        if seconds >= START_S or len(self._first) >= MOST_FIRST:
+        if seconds >= START_S or len(self._first) >= MAX_FIRST:
             self._start(batches)
 
     def _add_delay(self, delay_s: float) -> None:
@@ -270,7 +270,7 @@ def _showing(show: Show | None) -> Iterator[_Batches]:
 
 def _show_all(batches: Iterable[list[tuple[Sample, np.ndarray, np.ndarray]]], show: Show) -> None:
     """Show each batch; samples that are not newer than those before are left out."""
-    last_ns, count = -MOST_NS - 1, 0
+    last_ns, count = -MAX_NS - 1, 0
     for batch in batches:
         rows = []
         for row in batch:

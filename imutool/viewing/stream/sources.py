@@ -24,7 +24,7 @@ from imutool.errors import ConfigError, LogError, not_installed
 from imutool.file_location import STORES, to_location
 from imutool.mcap_io.temperature import temperatures
 from imutool.recording import Scalars
-from imutool.recording.columns import MOST_GAP_S
+from imutool.recording.columns import MAX_GAP_S
 from imutool.viewing.stream.samples import Malformed, Sample, decoded
 
 logger = logging.getLogger("imutool")
@@ -33,7 +33,7 @@ ROSBRIDGE_PORT = 9090
 SILENT_S = 5.0  # without a sample, before a warning
 WAIT_S = 0.5  # for data, between looks at the time
 CONNECT_TIMEOUT_S = 5.0
-MOST_WAITING = 10_000  # messages between two looks
+MAX_WAITING = 10_000  # messages between two looks
 MAX_BYTES = 65_536  # of a message; a sample has some 200
 
 
@@ -110,7 +110,7 @@ def _replay(name: str, imu: str | None, speed: float, temperature: str | None) -
                     batch.stamp_ns.tolist(), batch.gyro.tolist(), batch.accel.tolist(), warm, strict=True
                 ):
                     step_s = 0.0 if last_ns is None else (stamp_ns - last_ns) * 1e-9
-                    due_s, last_ns = due_s + (step_s if 0.0 < step_s <= MOST_GAP_S else 0.0) / speed, stamp_ns
+                    due_s, last_ns = due_s + (step_s if 0.0 < step_s <= MAX_GAP_S else 0.0) / speed, stamp_ns
                     if (wait_s := due_s - time.perf_counter()) > 0.0:
                         time.sleep(wait_s)
                     yield Sample(stamp_ns, tuple(gyro), tuple(accel), due_s, celsius)
@@ -229,7 +229,7 @@ def _zenoh(name: str, malformed: Malformed) -> Samples:
         raise not_installed("eclipse-zenoh", "live", where=name, user="the source")
     import zenoh
 
-    parts, config, arrived = urlsplit(name), zenoh.Config(), Queue[tuple[float, bytes]](MOST_WAITING)
+    parts, config, arrived = urlsplit(name), zenoh.Config(), Queue[tuple[float, bytes]](MAX_WAITING)
     if parts.netloc:  # else peers are found on the local network
         config.insert_json5("connect/endpoints", f'["tcp/{parts.netloc}"]')
         config.insert_json5("mode", '"client"')
@@ -240,7 +240,7 @@ def _zenoh(name: str, malformed: Malformed) -> Samples:
         try:
             arrived.put_nowait((time.perf_counter(), payload))
         except Full as error:
-            malformed.add(payload, ValueError(f"lost: {MOST_WAITING} messages wait already ({error!r})"))
+            malformed.add(payload, ValueError(f"lost: {MAX_WAITING} messages wait already ({error!r})"))
 
     try:
         session.enter_context(zenoh.open(config)).declare_subscriber(parts.path.strip("/"), arrive)

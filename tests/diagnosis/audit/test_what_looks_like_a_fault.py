@@ -16,7 +16,7 @@ from support.benchmarks import benchmark
 from imutool.config import build
 from imutool.diagnosis.audit import audit, lines, simulator_faults
 from imutool.diagnosis.audit.axes import Matrix
-from imutool.diagnosis.audit.bandwidth import most_filter_delay
+from imutool.diagnosis.audit.bandwidth import max_filter_delay
 from imutool.diagnosis.audit.motion import kinematic_fit, kinematics
 from imutool.diagnosis.audit.noise import Expected, fast_noise, noise_faults
 from imutool.diagnosis.audit.timing import clear, timing_faults
@@ -108,7 +108,7 @@ def test_a_filter_that_the_noise_shows_may_be_late(order: int, cut: float) -> No
     sheet = build(Noise, {f"{s}_density": (float(std / np.sqrt(rate_hz)),) * 3 for s, std in (("gyro", 2e-3), ("accel", 2e-2))})
     assert simulator_faults(replace(sim, imu=imu), None, sheet) == []
     white = np.random.default_rng(2).normal(size=(4000, 3))
-    assert most_filter_delay(white, white) == 0.0
+    assert max_filter_delay(white, white) == 0.0
 
 
 def test_what_grows_with_the_frequency_is_an_error_of_the_curve() -> None:

@@ -177,7 +177,7 @@ def test_a_candidate_that_single_precision_leaves_singular_gains_nothing() -> No
     (effect,) = catalogue.effects(["lever_arm"])
     start = np.zeros(3)
     score = object.__new__(CandidateScore)
-    score.N, score.g, score.left, score.total, score.axes = np.zeros((0, 0)), np.zeros(0), 2.0, 2.0, []
+    score.N, score.g, score.remaining, score.total, score.axes = np.zeros((0, 0)), np.zeros(0), 2.0, 2.0, []
     score.solved_g = score.g
     score.now = SimpleNamespace(settings=FitSettings())  # type: ignore[assignment]
     singular = SimpleNamespace(start=start, rows=[], N=np.zeros((3, 3)))  # the prior's ones are lost

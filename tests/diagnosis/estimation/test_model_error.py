@@ -88,9 +88,9 @@ def test_what_moves_with_the_body_is_more_than_the_rounding_of_a_simulation(name
     now = fit([planted.weighed(planted.pair(felt))], ())
     (effect,) = catalogue.diagnosed([name])
     gyro = (planted.ideal(felt)[:, :3] - planted.ideal(felt)[:, :3].mean(axis=0)) / planted.NOISE[0]
-    least = SETTINGS.model_error_reference * float((gyro[now.logs[0].rows("fitted")] ** 2).sum())
-    assert below_reference_error(effect, 0.99 * least, now) == below
-    assert not below_reference_error(effect, 1.01 * least, now)
+    minimum = SETTINGS.model_error_reference * float((gyro[now.logs[0].rows("fitted")] ** 2).sum())
+    assert below_reference_error(effect, 0.99 * minimum, now) == below
+    assert not below_reference_error(effect, 1.01 * minimum, now)
 
 
 @pytest.mark.parametrize(("name", "rim"), [("accel_scale", True), ("accel_bias_step", False), ("gyro_scale", False)])

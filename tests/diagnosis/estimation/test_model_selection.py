@@ -615,7 +615,7 @@ def test_a_temperature_that_rises_as_the_bias_does_is_named_beside_the_drift() -
 def test_an_effect_on_the_other_sensor_that_explains_as_much_is_no_rival() -> None:
     """A search that may find one effect leaves the other one unexplained, and that puts no name in doubt."""
     pair = planted.pair(planted.shaken(2, DURATION_S), {"gyro_scale": [0.02] * 3, "lever_arm": [0.01, 0.0, 0.0]}, 5)
-    one = msgspec.structs.replace(pair.settings, search=msgspec.structs.replace(pair.settings.search, most_effects=1))
+    one = msgspec.structs.replace(pair.settings, search=msgspec.structs.replace(pair.settings.search, max_effects=1))
     log = planted.weighed(replace(pair, settings=one))
     arm, scale = planted.acting({"lever_arm": [0.0] * 3, "gyro_scale": [0.0] * 3})
     assert select_effects([log], (arm[0], scale[0]), begin=(arm,)).similar() == {"lever_arm": ()}
@@ -736,9 +736,9 @@ def test_a_low_pass_of_one_sensor_is_told_on_it() -> None:
     assert sure(found, "second_order_low_pass:accel", [8.0, 0.7])
 
 
-def trembling(most_hz: float) -> IdealMotion:
+def trembling(max_hz: float) -> IdealMotion:
     """A body that moves up to some frequency."""
-    felt, rng, band = planted.rich(), np.random.default_rng(6), butter(4, most_hz, fs=planted.RATE_HZ, output="sos")
+    felt, rng, band = planted.rich(), np.random.default_rng(6), butter(4, max_hz, fs=planted.RATE_HZ, output="sos")
     gyro, accel = (
         x + sosfilt(band, size * rng.normal(size=x.shape), axis=0) for x, size in ((felt.gyro, 0.2), (felt.accel, 2.0))
     )

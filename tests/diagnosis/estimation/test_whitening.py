@@ -163,11 +163,11 @@ def test_level_is_the_same_with_a_third_of_the_rows_left_out() -> None:
 def test_a_band_passes_what_is_slower_and_blocks_what_is_faster(rate_hz: float) -> None:
     band = Band.below(8.0, rate_hz)
     t = np.arange(int(20.0 * rate_hz)) / rate_hz
-    for f_hz, least, most in ((0.5, 0.99, 1.01), (3.0, 0.99, 1.01), (20.0, 0.0, 0.01), (35.0, 0.0, 0.01)):
+    for f_hz, minimum, maximum in ((0.5, 0.99, 1.01), (3.0, 0.99, 1.01), (20.0, 0.0, 0.01), (35.0, 0.0, 0.01)):
         x = np.repeat(np.sin(2.0 * np.pi * f_hz * t)[:, None], 6, axis=1)
         inner = slice(len(x[:: band.every]) // 10, -len(x[:: band.every]) // 10)
         ratio = float(band(x)[inner].std() / np.sqrt(0.5))
-        assert least <= ratio <= most, f"{f_hz} Hz: {ratio:.4f}"
+        assert minimum <= ratio <= maximum, f"{f_hz} Hz: {ratio:.4f}"
 
 
 def test_a_band_does_not_delay() -> None:

@@ -66,7 +66,7 @@ def test_orientations_alone_say_nothing_of_the_accelerometer() -> None:
 def test_of_recordings_that_are_too_long_together_the_first_parts_are_compared() -> None:
     """A diagnosis takes kilobytes for each sample, so that hours would take the memory of the machine."""
     real, settings = made(EXACT), DiagnoseSettings()
-    half = msgspec.structs.replace(settings, alignment=msgspec.structs.replace(settings.alignment, most_samples=len(real.imu)))
+    half = msgspec.structs.replace(settings, alignment=msgspec.structs.replace(settings.alignment, max_samples=len(real.imu)))
     pairs, remarks = align_all([real, replace(real, name="again")], along(real), None, half)
     assert [float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs] == pytest.approx([DURATION_S / 2] * 2, abs=0.2)
     assert {pair.log_start_ns for pair in pairs} == {int(real.imu.t_ns[0])}
@@ -164,8 +164,8 @@ def test_a_simulation_that_holds_its_samples_is_read_where_its_physics_steps() -
     (whole,), none = align_all([recorded], replace(sim, truths={}), None, DiagnoseSettings())
     assert none == []
     assert f"{np.count_nonzero(last != np.arange(len(last)))} samples repeat gyro or accel of the one before" in remarks[0]
-    left, least = ((one.real - expected(one, ()))[100:-100].std(axis=0) for one in (pair, whole))
-    assert (left < HELD_LEAVES * least).all()
+    left, minimum = ((one.real - expected(one, ()))[100:-100].std(axis=0) for one in (pair, whole))
+    assert (left < HELD_LEAVES * minimum).all()
 
 
 @pytest.mark.parametrize("turn", TO_Z_UP.values())

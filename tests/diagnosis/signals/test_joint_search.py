@@ -82,11 +82,11 @@ def test_an_arm_is_searched_for_two_effects_a_joint_and_not_beyond_the_error_of_
 
     monkeypatch.setattr(signal_diagnosis, "select_effects", select)
     usual = SearchSettings()
-    settings = DiagnoseSettings(search=SearchSettings(most_effects=3))
+    settings = DiagnoseSettings(search=SearchSettings(max_effects=3))
     with pytest.raises(EnoughError):
         signal_diagnosis.diagnose_signal(pair(), {}, settings)
     (search,) = asked
-    assert search.most_effects == usual.effects_each_column * JOINTS == 4
+    assert search.max_effects == usual.effects_each_column * JOINTS == 4
     assert search.negligible_share == SMALL_GAIN == 0.003
 
 

@@ -62,11 +62,11 @@ def test_the_memory_for_chunks_that_unpack_to_zeros_is_that_of_one(foreign: Fore
     tracemalloc.start()
     try:
         report = repair(log, tmp_path / "out.mcap")
-        _, most = tracemalloc.get_traced_memory()
+        _, maximum = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
     assert report.messages == {"/mine": 3}
-    assert most < 3 * len(zeros)
+    assert maximum < 3 * len(zeros)
 
 
 def test_a_summary_that_follows_a_part_of_itself_says_whose_the_chunks_are(foreign: Foreign, tmp_path: Path) -> None:

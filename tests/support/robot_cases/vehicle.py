@@ -42,9 +42,9 @@ class InFlight:
     range_offset: float = 0.0
 
 
-def smooth(rng: np.random.Generator, t_s: Float64[np.ndarray, " n"], most_hz: float, size: float) -> Float64[np.ndarray, " n"]:
+def smooth(rng: np.random.Generator, t_s: Float64[np.ndarray, " n"], max_hz: float, size: float) -> Float64[np.ndarray, " n"]:
     """A sum of eight sines of a standard deviation."""
-    w = 2.0 * np.pi * rng.uniform(0.04, most_hz, 8)
+    w = 2.0 * np.pi * rng.uniform(0.04, max_hz, 8)
     out = (rng.uniform(0.5, 1.0, 8)[:, None] * np.sin(np.outer(w, t_s) + rng.uniform(0.0, 6.3, 8)[:, None])).sum(axis=0)
     return np.asarray(size * out / out.std())
 

@@ -161,12 +161,12 @@ def test_what_is_left_of_the_windows_is_next_to_nothing(flights: list[Recording]
     found, pool = calibrate(made), Pool.of(made)
     model = linear.Network().double().requires_grad_(False)
     rest = torch.cat([found["gyro"].rest, found["accel"].rest], dim=1)
-    for sensor, most in (("gyro", 1e-4), ("accel", 5e-3)):  # rad and m/s; the biases alone had moved it by 0.05 and 0.5
+    for sensor, maximum in (("gyro", 1e-4), ("accel", 5e-3)):  # rad and m/s; the biases alone had moved it by 0.05 and 0.5
         model.begin_at(sensor, found[sensor].W)  # type: ignore[arg-type]
         first = pool.starts(pool.samples(1.0), "train", hop=50)
         windows = pool.windows(first, pool.samples(1.0), rest[pool.log[first]])
         e, _ = closed_form.sensor_residual(model, sensor, windows)  # type: ignore[arg-type]
-        assert e.norm(dim=1).median() < most, sensor
+        assert e.norm(dim=1).median() < maximum, sensor
 
 
 def test_the_derivative_of_a_window_is_that_of_finite_differences(flights: list[Recording], planted: Make) -> None:

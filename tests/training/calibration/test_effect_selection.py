@@ -31,7 +31,7 @@ SURE = 3.0  # standard deviations
 NEAR_PRIOR = 0.3  # deviations of the prior, of what the motion does not show
 # A clock or an arm may be each log's own: only that all logs have the same one speaks for an effect. A drift shows in long
 # windows, of which such a flight has few.
-LEAST_GAIN = {"clock_offset": 0.05, "lever_arm": 0.05, "gyro_bias_drift": 0.2}
+MIN_GAIN = {"clock_offset": 0.05, "lever_arm": 0.05, "gyro_bias_drift": 0.2}
 OTHERS = (1, 16)  # first of three flights; long windows of some fit their log's own unknowns too well
 # what a flight of a quadrotor's kind shows: sizes that change its drift several times over
 GYRO = ("gyro_scale", "gyro_misalignment", "gyro_g_sensitivity", "gyro_quadratic", "gyro_bias_drift", "clock_offset")
@@ -108,7 +108,7 @@ def test_a_planted_effect_is_found_and_named_and_no_other(flights: list[Recordin
     calibration = found(flights, sensor, effects)
     assert set(calibration.effects) == {name, *LINEAR[sensor]}
     assert next(iter(calibration.gains)) == name
-    assert calibration.gains[name] > LEAST_GAIN.get(name, 0.3)
+    assert calibration.gains[name] > MIN_GAIN.get(name, 0.3)
     planted = dict(zip(of_effects([name], sensor), planted_theta(effects), strict=True))
     z = z_scores(calibration, np.array([planted.get(key, 0.0) for key in of_effects(calibration.effects, sensor)]))
     assert np.abs(z).max() < SURE, z

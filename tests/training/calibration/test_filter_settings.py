@@ -10,7 +10,7 @@ from imutool.bias import conv, hybrid, static
 from imutool.bias_start.initial_bias import UNKNOWN_BODY, bias_prior
 from imutool.inertial.inertial_filter import FilterSettings
 from imutool.recording import Imu, Poses, Recording
-from imutool.training.calibration.filter_settings import LEAST_TURN_ERROR, filter_settings
+from imutool.training.calibration.filter_settings import MIN_TURN_ERROR, filter_settings
 from imutool.training.training_windows import Pool
 
 
@@ -36,9 +36,7 @@ def test_logs_of_a_vehicle_widen_the_bound_on_speed() -> None:
     assert 1.0 < found["speed_correlation_s"] < 20.0
 
 
-@pytest.mark.parametrize(
-    ("scale_std", "error"), [(1e-5, LEAST_TURN_ERROR), (1.5e-3, 1.5e-3), (0.1, FilterSettings().gyro_scale)]
-)
+@pytest.mark.parametrize(("scale_std", "error"), [(1e-5, MIN_TURN_ERROR), (1.5e-3, 1.5e-3), (0.1, FilterSettings().gyro_scale)])
 def test_a_sure_calibration_lets_the_filter_believe_in_turns(scale_std: float, error: float) -> None:
     """Turns to and fro, whose scale is known to `scale_std`, of a gyro with a bias that is no turn."""
     t_s, rate_hz = np.arange(0.0, 60.0, 0.05), 20.0

@@ -183,14 +183,14 @@ def test_pieces_of_a_log_differ_in_their_rest_bias(data: Data) -> None:
     merged = split.merged(H, g, c, "gyro", p)
     assert torch.equal(merged[0][1], H[2])
     assert merged[2][1] == c[2]
-    at, least = torch.tensor([0.3, -0.2, 0.1, 0.4]).double(), 0.0
+    at, minimum = torch.tensor([0.3, -0.2, 0.1, 0.4]).double(), 0.0
     for J, r in losses[:2]:
         e, by_rest = J @ at + r, J[:, rest]
         ridge = torch.eye(3).double() / WANDER["gyro"] ** 2
         off = -torch.linalg.solve(by_rest.T @ by_rest + ridge, by_rest.T @ e)
-        least += float((e + by_rest @ off).square().sum() + off @ ridge @ off)
+        minimum += float((e + by_rest @ off).square().sum() + off @ ridge @ off)
     found = merged[2][0] + 2.0 * merged[1][0] @ at + at @ merged[0][0] @ at
-    assert float(found) == pytest.approx(least, rel=ROUNDING)
+    assert float(found) == pytest.approx(minimum, rel=ROUNDING)
 
 
 def test_a_bias_that_wanders_over_a_long_log_is_no_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:

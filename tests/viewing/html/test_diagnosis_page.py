@@ -27,7 +27,7 @@ from imutool.viewing.html.page import text
 from imutool.viewing.model import decimation
 
 Page, svgs = markup.Page, markup.svgs
-MOST_BYTES = 3_000_000
+MAX_BYTES = 3_000_000
 # Welch's estimate over 30 s has about 14 independent windows and three axes, and a bin at the top averages many frequencies.
 DENSITY = 0.05
 
@@ -107,7 +107,7 @@ def test_a_curve_is_drawn_for_the_axes_that_have_one() -> None:
 
 
 def test_three_logs_stay_small_whole_and_without_a_request(three: str) -> None:
-    assert len(three.encode()) < MOST_BYTES
+    assert len(three.encode()) < MAX_BYTES
     page = Page(three)
     assert page.addresses  # markers of lines are used by their identifiers
     assert all(address.startswith("#") for address in page.addresses)
@@ -168,7 +168,7 @@ def test_ten_logs_draw_the_first_four_and_say_so() -> None:
     many = tuple(diagnoses.traces(f"log {k}", late=True, seed=k, duration_s=20.0) for k in range(10))
     d = replace(diagnoses.LATE, real=("x.mcap",) * 10, bias=np.zeros((10, 6)), traces=many)
     content = html(d)
-    assert len(content.encode()) < MOST_BYTES
+    assert len(content.encode()) < MAX_BYTES
     assert "The first 4 of 10 logs are drawn" in Page(content).text
     assert Page(content).text.count(": over time.") == 4
 

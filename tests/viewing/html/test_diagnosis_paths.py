@@ -10,7 +10,7 @@ from support import diagnoses
 
 from imutool.diagnosis.result import Traces
 from imutool.recording import Poses
-from imutool.viewing.html.diagnosis_paths import MOST_S, held_out_stretches, paths, rms_drift
+from imutool.viewing.html.diagnosis_paths import MAX_S, held_out_stretches, paths, rms_drift
 
 RATE_HZ, SECONDS = 100.0, 40.0
 TURN_RAD_S, PUSH_M_S2 = 0.01, 0.2  # what is left out of a sensor at rest
@@ -42,7 +42,7 @@ def test_what_is_left_out_drifts_as_it_must_and_what_is_modelled_does_not() -> N
 
 def test_a_long_stretch_is_cut_and_a_gap_is_never_crossed() -> None:
     trace = replace(at_rest(), held_out=np.ones(int(SECONDS * RATE_HZ), bool))
-    assert [one.truth.duration_s for one in held_out_stretches(trace)] == pytest.approx([MOST_S] * 4, abs=0.02)
+    assert [one.truth.duration_s for one in held_out_stretches(trace)] == pytest.approx([MAX_S] * 4, abs=0.02)
     ideal = trace.ideal.copy()
     ideal[500:600] = np.nan
     assert all(

@@ -35,7 +35,7 @@ from imutool.viewing.model.trajectory_error import Drift, Errors, Window
 Page, svgs, curves = markup.Page, markup.svgs, markup.curves
 SECONDS, STILL_S = 20.0, 6.0  # of a flight, and of its rest before that
 HOUR = 720_000  # samples at 200 Hz
-MOST_BYTES, MOST_BYTES_OF_AN_HOUR = 1_500_000, 6_000_000
+MAX_BYTES, MAX_BYTES_OF_AN_HOUR = 1_500_000, 6_000_000
 PIXEL = 0.05  # points; a drawing has two decimals
 HOSTILE = '<img src=x onerror=alert(1)>"&\u202e../../x$y$'
 CONTRAST = 3.0  # of lines and large letters against what is behind them (WCAG 1.4.11)
@@ -531,7 +531,7 @@ def test_no_request_leaves_it_and_it_runs_nothing(page: str) -> None:
     assert not parsed.tags & {"script", "link", "iframe", "img", "object"}
     assert parsed.handlers == []
     assert not re.search(r"@import|url\((?!#)", page)
-    assert len(page.encode()) < MOST_BYTES
+    assert len(page.encode()) < MAX_BYTES
 
 
 def test_names_from_anywhere_are_words_and_nothing_else(seen: RunData) -> None:
@@ -593,7 +593,7 @@ def test_an_hour_stays_small() -> None:
     traces = tuple(Trace(run, path, errors, windows=window, figures=figures) for run in runs)
     events = tuple(Event("gap", int(t), int(t) + 10**7, "gap") for t in t_ns[::1000])
     data = RunData("hour", 0, int(t_ns[-1]), path, {}, traces, (), events=events)
-    assert len(report.page([data]).encode()) < MOST_BYTES_OF_AN_HOUR
+    assert len(report.page([data]).encode()) < MAX_BYTES_OF_AN_HOUR
 
 
 # ── files ──

@@ -253,11 +253,11 @@ def test_the_settings_of_a_triad_are_all_switched_off_here() -> None:
 @given(n=st.integers(1, 3000), k=st.integers(1, 6), more=st.integers(0, 500), seed=st.integers(0, 2**32 - 1))
 def test_a_thinned_curve_has_every_column_s_extremes_and_its_ends(n: int, k: int, more: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    most = 2 * k + 3 + more
+    maximum = 2 * k + 3 + more
     values = rng.normal(size=(n, k))
     values[rng.integers(0, n)] = 100.0
-    rows = curve_rows(values, most)
-    assert len(rows) <= max(most, 0)
+    rows = curve_rows(values, maximum)
+    assert len(rows) <= max(maximum, 0)
     assert (np.diff(rows) > 0).all()
     assert rows[0] == 0
     assert rows[-1] == n - 1
@@ -266,10 +266,10 @@ def test_a_thinned_curve_has_every_column_s_extremes_and_its_ends(n: int, k: int
 
 
 def test_every_bucket_keeps_its_own_extremes() -> None:
-    n, most = 100_000, 2000
+    n, maximum = 100_000, 2000
     values = np.random.default_rng(0).normal(size=(n, 3))
-    rows = curve_rows(values, most)
-    size = -(-n // ((most - 2) // 7))
+    rows = curve_rows(values, maximum)
+    size = -(-n // ((maximum - 2) // 7))
     for first in range(0, n, size):
         inside = rows[(rows >= first) & (rows < first + size)]
         assert np.array_equal(values[inside].max(axis=0), values[first : first + size].max(axis=0))
@@ -298,20 +298,20 @@ def test_a_short_curve_is_whole() -> None:
 
 
 @pytest.mark.parametrize("most", [10, 101, 1000])
-def test_what_is_left_out_of_a_path_is_near_what_is_drawn_in_time_and_along_it(most: int) -> None:
+def test_what_is_left_out_of_a_path_is_near_what_is_drawn_in_time_and_along_it(maximum: int) -> None:
     n = 20_000
     steps = np.random.default_rng(1).normal(size=(n, 3))
     steps[5_000:9_000] = 0.0  # at rest
     steps[15_000:15_100] *= 500.0  # and suddenly away
     p_wb = np.cumsum(steps, axis=0)
-    rows = path_rows(p_wb, most)
+    rows = path_rows(p_wb, maximum)
     assert rows[0] == 0
     assert rows[-1] == n - 1
-    assert len(rows) <= most
+    assert len(rows) <= maximum
     assert (np.diff(rows) > 0).all()
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p_wb, axis=0), axis=1))])
     before = rows[np.searchsorted(rows, np.arange(n), side="right") - 1]
-    share = 2.0 / (most - 2)
+    share = 2.0 / (maximum - 2)
     assert (travelled - travelled[before]).max() <= share * travelled[-1]
     assert (np.arange(n) - before).max() <= share * n + 1
 

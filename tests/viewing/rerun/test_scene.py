@@ -185,13 +185,13 @@ def test_the_worst_moment_is_marked_where_it_is(one: RunData, entities: SimpleNa
     [("MAX_CURVE_ROWS", "/imu/accel/raw", 200), ("MAX_DERIVED_ROWS", "/error/position/raw/axes", 100)],
 )
 def test_a_very_long_curve_is_thinned_with_its_extremes_kept(
-    one: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, path: str, most: int
+    one: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, path: str, maximum: int
 ) -> None:
-    monkeypatch.setattr(signals, limit, most)
+    monkeypatch.setattr(signals, limit, maximum)
     found = saved_rrd.read(saved_rrd.written([one], tmp_path / "thin.rrd"))
     t_ns, whole = expected(one)[path]
     values = found[path].numbers(SCALARS)
-    assert len(values) <= most < len(whole)
+    assert len(values) <= maximum < len(whole)
     np.testing.assert_array_equal(values.min(axis=0), whole.min(axis=0))
     np.testing.assert_array_equal(values.max(axis=0), whole.max(axis=0))
     np.testing.assert_array_equal(values, whole[np.searchsorted(t_ns, found[path].times(SCALARS, "ros2_timestamp"))])

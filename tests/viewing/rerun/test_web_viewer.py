@@ -21,7 +21,7 @@ from support.processes import SOON_S
 from imutool.viewing.rerun.entities.styles import XYZ
 
 SIZE = {"width": 800, "height": 500}  # software draws it
-LEAST = 200  # pixels of a colour; a legend alone has some fifty
+MIN = 200  # pixels of a colour; a legend alone has some fifty
 WAITS_S = 120.0  # some ten on an idle machine
 AT_S = "15"  # the cursor is put somewhere, or the log would play and no two pictures be the same
 ELSEWHERE = "http://imutool.invalid/telemetry"
@@ -89,7 +89,7 @@ class Visit:
 
 def draws(picture: Any) -> bool:
     """Whether all three axes are there."""
-    return all(viewers.drawn(picture, color) >= LEAST for color in XYZ)
+    return all(viewers.drawn(picture, color) >= MIN for color in XYZ)
 
 
 def is_up(picture: Any) -> bool:

@@ -202,7 +202,7 @@ def test_a_clock_that_begins_below_zero_does_not_jump(imu: Imu, caplog: pytest.L
 
 
 def test_a_clock_that_jumps_at_each_sample_does_not_delay_the_start_for_ever(imu: Imu, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "MOST_FIRST", 100)
+    monkeypatch.setattr(session, "MAX_FIRST", 100)
     corrected: list[int] = []
     odd = (found._replace(stamp_ns=found.stamp_ns + k % 2 * 10**15) for k, found in enumerate(stream(imu)))
     first = (found for found, _ in zip(odd, range(101), strict=False))

@@ -11,7 +11,7 @@ import numpy as np
 from imutool.diagnosis.estimation.observability import LOW_PASSES, SHARED
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.effects.gyro_dead_band import LOST, ZONE
-from imutool.sensor.effects.gyro_hysteresis import LEAST, SHARE, error_and_ideal, play
+from imutool.sensor.effects.gyro_hysteresis import MIN, SHARE, error_and_ideal, play
 from imutool.sensor.effects.low_pass import ORDER, RATE, SMOOTHING, of_one
 from imutool.sensor.effects.mount_resonance import DAMPER
 from imutool.sensor.samples import IdealMotion, SensorSamples
@@ -63,7 +63,7 @@ def exponential(of_analog: Effect) -> Effect:
 def _of_low_pass(effect: Effect, *, exact: bool) -> list[Effect]:
     """Forms of a low-pass without a rate; another effect itself.
 
-    With `exact`, beside a simulation, a low-pass may be of each sensor alone, or of another order.
+    With `exact`, against a simulation, a low-pass may be of each sensor alone, or of another order.
     """
     if effect.lagless is None:
         return [effect]
@@ -71,12 +71,12 @@ def _of_low_pass(effect: Effect, *, exact: bool) -> list[Effect]:
     if not exact:
         return [both]
     each = [both, *(of_one(both, sensor) for sensor in SENSORS)]
-    return [*each, *(of_order(one, order) for one in each for order in higher)]
+    return [*each, *(of_order(form, order) for form in each for order in higher)]
 
 
 def analog(effect: Effect) -> Effect:
     """A low-pass without the rate of a digital one, of its lowest order."""
-    starts, kept = effect.starts, tuple(one for one in effect.parameters if one not in (RATE, ORDER, SMOOTHING))
+    starts, kept = effect.starts, tuple(p for p in effect.parameters if p not in (RATE, ORDER, SMOOTHING))
     assert starts is not None, "a low-pass has starts"
     return replace(effect, parameters=kept, starts=lambda motion, at: [theta[: len(kept)] for theta in starts(motion, at)])
 
@@ -112,7 +112,7 @@ def _of_hysteresis(effect: Effect, *, exact: bool) -> list[Effect]:
         behind = [play(ideal, width) - ideal for width in widths]
         lags = [(lag - lag.mean(axis=0)) for lag in behind]
         return [
-            np.array([max(width, LEAST * effect.plausible[0]), (error * lag).sum() / max((lag**2).sum(), 1e-300)])
+            np.array([max(width, MIN * effect.plausible[0]), (error * lag).sum() / max((lag**2).sum(), 1e-300)])
             for width, lag in zip(widths, lags, strict=True)
         ]
 

@@ -1,4 +1,4 @@
-"""Forms of filters: a low-pass beside a clock offset, or digital; a resonance."""
+"""Forms of filters: a low-pass together with a clock offset, or digital; a resonance."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from imutool.units import SENSORS
 
 LAGS = (*LOW_PASSES, "clock_offset", "gyro_delay")
 HYSTERESIS = "accel_hysteresis"
-LEAST_LAG = 0.05  # of a sample period: less is no filter that a log shows
-CLOCKS_SHARE = 0.5  # of the lag that both sensors have, from where the fit of a clock beside filters starts
+MIN_LAG = 0.05  # of a sample period: less is no filter that a log shows
+CLOCKS_SHARE = 0.5  # of the lag that both sensors have, from where the fit of a clock together with filters starts
 TAKEN_BACK = 0.5  # of a low-pass's lag: a clock that leaves less takes it back
 SLOWEST = 0.9  # samples of a digital filter for one that is recorded
 
@@ -50,17 +50,17 @@ def lag_taken_back(others: Chosen, effect: Effect, start: Theta) -> list[Chosen]
     return [(*others[:place], (offset, tau_s + np.array([lag_s])), *others[place + 1 :], (effect, start))]
 
 
-def without_unseen_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect], settings: SearchSettings) -> Fit:
+def without_unseen_low_pass(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect], settings: SearchSettings) -> Fit:
     """Fit with a clock offset for a low pass beyond the poses' band, which its delay shows."""
-    offset = next((e for e in named if e.name == "clock_offset" and e.key not in now.keys), None)
-    for k, (effect, theta) in enumerate(now.chosen):
+    offset = next((e for e in named if e.name == "clock_offset" and e.key not in base.keys), None)
+    for k, (effect, theta) in enumerate(base.chosen):
         if offset is not None and effect.name in LOW_PASSES and beyond_the_band(effect, theta, logs, settings):
             delayed = offset, np.array([-Design.of(effect, theta).lag_s])  # far below its cut-off
-            return fit(logs, (*now.chosen[:k], *now.chosen[k + 1 :], delayed), near=now)
-    return now
+            return fit(logs, (*base.chosen[:k], *base.chosen[k + 1 :], delayed), near=base)
+    return base
 
 
-def with_form_of_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect]) -> Fit:
+def with_form_of_low_pass(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with another form of a low-pass that is clearly better (BIC).
 
     Forms are its order, a digital filter, and filters of one sensor or of each by itself.
@@ -69,116 +69,117 @@ def with_form_of_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequence
     (its noise was filtered, it folds vibrations), a filter of other sensors has to explain more than that.
     """
     if not all(isinstance(log.pair, Pair) and log.pair.exact for log in logs):
-        return now
+        return base
     settings, period_s = logs[0].pair.settings.search, logs[0].pair.period_s
     error = _model_error(logs)
-    for k, (effect, _) in enumerate(now.chosen):
+    for k, (effect, _) in enumerate(base.chosen):
         if effect.name not in LOW_PASSES or {RATE, SMOOTHING} & {*effect.parameters}:
             continue
-        errs, best = error * _taken(now, k), now
-        for chosen in _forms(now, k, _allowed(now, k, named), 1.0 / period_s):
-            least = settings.clearly_better if _sensors(chosen) == _sensors(now.chosen) else max(settings.clearly_better, errs)
-            trial = fit(logs, chosen, near=now, give_up_above=bic(best) - least)
-            if _form_bic(trial) < _form_bic(best) and bic(trial) < bic(now) - least and not _folds(trial, period_s):
+        errs, best = error * _taken(base, k), base
+        for chosen in _forms(base, k, _allowed(base, k, named), 1.0 / period_s):
+            margin = max(settings.clearly_better, 0.0 if _sensors(chosen) == _sensors(base.chosen) else errs)
+            trial = fit(logs, chosen, near=base, give_up_above=bic(best) - margin)
+            if _form_bic(trial) < _form_bic(best) and bic(trial) < bic(base) - margin and not _folds(trial, period_s):
                 best = trial
-        if best is not now:
+        if best is not base:
             return with_form_of_low_pass(logs, best, named)
-        two = _of_each_sensor(now, k, named)
-        trial = fit(logs, two, near=now) if two else now
-        if bic(trial) < bic(now) - settings.model_error_low_pass / error * max(settings.clearly_better, errs):
+        two = _of_each_sensor(base, k, named)
+        trial = fit(logs, two, near=base) if two else base
+        if bic(trial) < bic(base) - settings.model_error_low_pass / error * max(settings.clearly_better, errs):
             for sensor in SENSORS:  # a second order that only fits with an endless damping is a first one
                 trial = _with_own_form(logs, trial, (sensor,), named)
             return with_form_of_low_pass(logs, trial, named)
-    return now
+    return base
 
 
-def with_form_of_resonance(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect]) -> Fit:
+def with_form_of_resonance(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with a resonance whose damper is elsewhere, where that is clearly better (BIC)."""
     if not all(log.pair.exact for log in logs):
-        return now
-    for k, (effect, theta) in enumerate(now.chosen):
-        for other in [one for one in named if one.name == effect.name == "mount_resonance" and one.key != effect.key]:
-            trial = fit(logs, (*now.chosen[:k], (other, theta), *now.chosen[k + 1 :]), near=now, give_up_above=now.objective)
-            if bic(trial) < bic(now) - logs[0].pair.settings.search.clearly_better:
+        return base
+    for k, (effect, theta) in enumerate(base.chosen):
+        for other in [e for e in named if e.name == effect.name == "mount_resonance" and e.key != effect.key]:
+            chosen = (*base.chosen[:k], (other, theta), *base.chosen[k + 1 :])
+            trial = fit(logs, chosen, near=base, give_up_above=base.objective)
+            if bic(trial) < bic(base) - logs[0].pair.settings.search.clearly_better:
                 return trial
-    return now
+    return base
 
 
-def with_delay_of_accel(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect]) -> Fit:
+def with_delay_of_accel(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with a delay of the accelerometer for a clearly worse filter of it (BIC).
 
     A late accelerometer is a clock that is late, and a gyro that is ahead of it. One alone of these two explains little, so
     that the search finds the low-pass of this lag, or of slow motion a hysteresis.
     """
-    both = [of for name in ("clock_offset", "gyro_delay") for of in named if of.name == name and of.key not in now.keys]
-    for k, (effect, theta) in enumerate(now.chosen):
+    both = [of for name in ("clock_offset", "gyro_delay") for of in named if of.name == name and of.key not in base.keys]
+    for k, (effect, theta) in enumerate(base.chosen):
         if len(both) == 2 and effect.name in (*LOW_PASSES, HYSTERESIS) and effect.sensors == ("accel",):
             start = np.array([0.0 if effect.name == HYSTERESIS else -Design.of(effect, theta).lag_s])
-            late = (*now.chosen[:k], *now.chosen[k + 1 :], *((of, start) for of in both))
+            late = (*base.chosen[:k], *base.chosen[k + 1 :], *((of, start) for of in both))
             settings = logs[0].pair.settings.search
-            trial = fit(logs, late, near=now, give_up_above=now.objective)
-            if bic(trial) >= bic(now) - settings.clearly_better:
-                return now
-            most = settings.hysteresis_leaves * (fit(logs, late[:-2], near=now).objective - trial.objective)
-            return now if effect.name == HYSTERESIS and leaves_slow_motion(trial, "accel", most) else trial
-    return now
+            trial = fit(logs, late, near=base, give_up_above=base.objective)
+            if bic(trial) >= bic(base) - settings.clearly_better:
+                return base
+            maximum = settings.hysteresis_leaves * (fit(logs, late[:-2], near=base).objective - trial.objective)
+            return base if effect.name == HYSTERESIS and leaves_slow_motion(trial, "accel", maximum) else trial
+    return base
 
 
-def with_filter_of_each_sensor(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect]) -> Fit:
+def with_filter_of_each_sensor(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with a low-pass of each sensor for lags of both, in its own form, if better (BIC).
 
     Chips filter gyro and accelerometer each in its own way. The search finds the larger filter on both sensors, and then a
     clock, or a gyro, that takes some of the lag back.
     """
     if not all(isinstance(log.pair, Pair) and log.pair.exact for log in logs):
-        return now
-    lags = [k for k, (effect, _) in enumerate(now.chosen) if effect.name in LAGS]
-    if not {now.chosen[k][0].name for k in lags} - {"clock_offset"} or (
-        len(lags) == 1 and now.chosen[lags[0]][0].name in LOW_PASSES
+        return base
+    lags = [k for k, (effect, _) in enumerate(base.chosen) if effect.name in LAGS]
+    if not {base.chosen[k][0].name for k in lags} - {"clock_offset"} or (
+        len(lags) == 1 and base.chosen[lags[0]][0].name in LOW_PASSES
     ):
-        return now
-    others, period_s = tuple(entry for k, entry in enumerate(now.chosen) if k not in lags), logs[0].pair.period_s
-    lag_s: dict[tuple[str, ...], float] = {(sensor,): sum(_lag_s(*now.chosen[k], sensor) for k in lags) for sensor in SENSORS}
+        return base
+    others, period_s = tuple(entry for k, entry in enumerate(base.chosen) if k not in lags), logs[0].pair.period_s
+    lag_s: dict[tuple[str, ...], float] = {(sensor,): sum(_lag_s(*base.chosen[k], sensor) for k in lags) for sensor in SENSORS}
     clocks, early_s = [of for of in named if of.name == "clock_offset"], min(0.0, *lag_s.values())
-    early_s = early_s if early_s < -LEAST_LAG * period_s else 0.0  # no filter is ahead, but a clock may be
-    late = [sensors for sensors, own_s in lag_s.items() if own_s - early_s > LEAST_LAG * period_s]
+    early_s = early_s if early_s < -MIN_LAG * period_s else 0.0  # no filter is ahead, but a clock may be
+    late = [sensors for sensors, own_s in lag_s.items() if own_s - early_s > MIN_LAG * period_s]
     second = [of for of in named if of.name == LOW_PASSES[1] and of.sensors in late]
     if not second or (early_s and not clocks):
-        return now
+        return base
 
     def beside(shared_s: float, *clock: tuple[Effect, Theta]) -> Fit:
         each = ((of, np.array([_cutoff_hz(of, [BUTTERWORTH], lag_s[of.sensors] - shared_s), BUTTERWORTH])) for of in second)
-        return fit(logs, (*others, *clock, *each), near=now)
+        return fit(logs, (*others, *clock, *each), near=base)
 
     best = beside(early_s, *((of, np.array([-early_s])) for of in clocks if early_s))
     for of in second:
         best = _with_own_form(logs, best, of.sensors, named)
     if early_s:  # with a filter in its place neither answer is the plainer one
         slack = logs[0].pair.settings.search.clearly_better if len(lags) > 1 else 0.0
-        return best if _form_bic(best) < _form_bic(now) + slack else now
+        return best if _form_bic(best) < _form_bic(base) + slack else base
     shared_s = CLOCKS_SHARE * min(lag_s.values())  # of the lag of both may be the clock's
     offsets = [beside(shared_s, (of, np.array([-shared_s]))) for of in clocks if len(second) > 1]
     best = min((best, *offsets), key=_form_bic)
-    if len(best.prior) < len(now.prior):  # simpler
-        return best if _form_bic(best) < _form_bic(now) else now
-    least = logs[0].pair.settings.search.clearly_better if len(best.prior) > len(now.prior) else 0.0
-    errs = _model_error(logs) * sum(_taken(now, k) for k in lags if now.chosen[k][0].name in LOW_PASSES)
-    return best if _form_bic(best) < _form_bic(now) - max(least, errs) else now
+    if len(best.prior) < len(base.prior):  # simpler
+        return best if _form_bic(best) < _form_bic(base) else base
+    margin = logs[0].pair.settings.search.clearly_better if len(best.prior) > len(base.prior) else 0.0
+    errs = _model_error(logs) * sum(_taken(base, k) for k in lags if base.chosen[k][0].name in LOW_PASSES)
+    return best if _form_bic(best) < _form_bic(base) - max(margin, errs) else base
 
 
 def _model_error(logs: Sequence[WhitenedLog]) -> float:
-    """Share of the squares of a filter by which its model may err, beside a simulation."""
+    """Share of the squares of a filter by which its model may err, against a simulation."""
     settings = logs[0].pair.settings.search
     return settings.model_error_denoised if any(log.pair.denoised for log in logs) else settings.model_error
 
 
-def _with_own_form(logs: Sequence[WhitenedLog], now: Fit, sensors: tuple[str, ...], named: Sequence[Effect]) -> Fit:
+def _with_own_form(logs: Sequence[WhitenedLog], base: Fit, sensors: tuple[str, ...], named: Sequence[Effect]) -> Fit:
     """Fit with the filter of one sensor in another form, if better."""
-    k = next(k for k, (effect, _) in enumerate(now.chosen) if effect.name in LOW_PASSES and effect.sensors == sensors)
-    period_s, best = logs[0].pair.period_s, now
+    k = next(k for k, (effect, _) in enumerate(base.chosen) if effect.name in LOW_PASSES and effect.sensors == sensors)
+    period_s, best = logs[0].pair.period_s, base
     forms = [of for of in named if of.name in LOW_PASSES and of.sensors == sensors]  # the other sensor may have another order
-    for chosen in _forms(now, k, forms, 1.0 / period_s):
-        trial = fit(logs, chosen, near=now, give_up_above=bic(best))
+    for chosen in _forms(base, k, forms, 1.0 / period_s):
+        trial = fit(logs, chosen, near=base, give_up_above=bic(best))
         best = trial if _form_bic(trial) < _form_bic(best) and not _folds(trial, period_s) else best
     return best
 
@@ -217,25 +218,25 @@ def _sensors(chosen: Chosen) -> list[tuple[str, ...]]:
     return sorted(effect.sensors for effect, _ in chosen if effect.name in LOW_PASSES)
 
 
-def _allowed(now: Fit, k: int, named: Sequence[Effect]) -> list[Effect]:
+def _allowed(base: Fit, k: int, named: Sequence[Effect]) -> list[Effect]:
     """Effects that may act beside all others but one."""
-    others = (*now.chosen[:k], *now.chosen[k + 1 :])
-    return [of for of in named if of.name not in LOW_PASSES or not any(exclude_each_other(of, one) for one, _ in others)]
+    others = (*base.chosen[:k], *base.chosen[k + 1 :])
+    return [of for of in named if of.name not in LOW_PASSES or not any(exclude_each_other(of, e) for e, _ in others)]
 
 
-def _forms(now: Fit, k: int, named: Sequence[Effect], rate_hz: float) -> Iterator[Chosen]:
+def _forms(base: Fit, k: int, named: Sequence[Effect], rate_hz: float) -> Iterator[Chosen]:
     """Effects with another form of a low-pass; a clock offset may share its lag."""
-    (effect, theta), others = now.chosen[k], (*now.chosen[:k], *now.chosen[k + 1 :])
-    offset = next((one for one in named if one.name == "clock_offset"), None)
+    (effect, theta), others = base.chosen[k], (*base.chosen[:k], *base.chosen[k + 1 :])
+    offset = next((e for e in named if e.name == "clock_offset"), None)
     lag_s, forms = Design.of(effect, theta).lag_s, [of for of in named if of.name in LOW_PASSES]
     for form in forms:
         for start in _starts(form, effect, theta, lag_s, rate_hz):
             yield (*others, start)
     if offset is None or len(effect.sensors) == 1:
         return
-    at_s = [float(tau_s[0]) for one, tau_s in others if one.key == offset.key]
+    at_s = [float(tau_s[0]) for e, tau_s in others if e.key == offset.key]
     without = tuple(entry for entry in others if entry[0].key != offset.key)
-    for form in forms if at_s else [one for one in forms if one.name == LOW_PASSES[0] and one.sensors == effect.sensors]:
+    for form in forms if at_s else [e for e in forms if e.name == LOW_PASSES[0] and e.sensors == effect.sensors]:
         start_s = lag_s - at_s[0] if at_s else 0.5 * lag_s
         for start in _starts(form, form, None, start_s, rate_hz) if start_s > 0.0 else ():
             yield (*without, start) if at_s else (*others, start, (offset, np.array([-start_s])))
@@ -258,15 +259,15 @@ def _cutoff_hz(of: Effect, others: Sequence[float], lag_s: float) -> float:
         return Design.of(of, np.array([np.exp(log_hz), *others])).lag_s - lag_s
 
     analog_hz = Design.of(of, np.array([1.0, *others])).lag_s / lag_s
-    least, most = np.log(analog_hz) - 3.0, np.log(analog_hz) + 1.0
-    return float(np.exp(brentq(longer_s, least, most))) if longer_s(least) > 0.0 > longer_s(most) else analog_hz
+    margin, maximum = np.log(analog_hz) - 3.0, np.log(analog_hz) + 1.0
+    return float(np.exp(brentq(longer_s, margin, maximum))) if longer_s(margin) > 0.0 > longer_s(maximum) else analog_hz
 
 
-def _of_each_sensor(now: Fit, k: int, named: Sequence[Effect]) -> Chosen:
+def _of_each_sensor(base: Fit, k: int, named: Sequence[Effect]) -> Chosen:
     """Effects with a low-pass for each sensor in the place of one for both; none without."""
-    effect, theta = now.chosen[k]
+    effect, theta = base.chosen[k]
     each = tuple((of, theta) for of in named if of.name == effect.name and len(of.sensors) < len(effect.sensors))
-    return (*now.chosen[:k], *each, *now.chosen[k + 1 :]) if each and not effect.constants else ()
+    return (*base.chosen[:k], *each, *base.chosen[k + 1 :]) if each and not effect.constants else ()
 
 
 def _taken(found: Fit, k: int) -> float:
@@ -281,5 +282,5 @@ def _taken(found: Fit, k: int) -> float:
 def _folds(found: Fit, period_s: float) -> bool:
     """Whether a digital filter is slower than the samples, which it would give twice."""
     designs = [Design.of(effect, theta) for effect, theta in found.chosen if effect.name in LOW_PASSES]
-    slowest_hz = min((min(one.rate_hz, one.smoothing_hz) for one in designs), default=np.inf)
+    slowest_hz = min((min(design.rate_hz, design.smoothing_hz) for design in designs), default=np.inf)
     return slowest_hz * period_s < SLOWEST

@@ -93,8 +93,8 @@ def is_part_of_misfit(effect: Effect, gain: float, found: Fit) -> bool:
 
     Whatever moves with the body explains some of such a misfit, so a name for it would be wrong.
     """
-    least = found.logs[0].pair.settings.search.larger_misfit * gain
-    return _follows_body(effect, found) and all(leaves_slow_motion(found, sensor, least) for sensor in effect.sensors)
+    minimum = found.logs[0].pair.settings.search.larger_misfit * gain
+    return _follows_body(effect, found) and all(leaves_slow_motion(found, sensor, minimum) for sensor in effect.sensors)
 
 
 def _follows_body(effect: Effect, found: Fit) -> bool:
@@ -128,18 +128,18 @@ class LowPassError(NamedTuple):
 
     @staticmethod
     def of(found: Fit) -> LowPassError | None:
-        """The error beside a simulation whose noise was filtered out; none without a low-pass."""
+        """The error against a simulation whose noise was filtered out; none without a low-pass."""
         filters = [(effect, theta) for effect, theta in found.chosen if effect.name in LOW_PASSES]
         if not filters or not any(isinstance(log.pair, Pair) and log.pair.denoised for log in found.logs):
             return None
         size, cutoff_hz = max((_taken(effect, theta, found), float(theta[0])) for effect, theta in filters)
         return LowPassError(size, found.logs[0].pair.settings.search.model_error_denoised * size, cutoff_hz)
 
-    def may_be(self, effect: Effect, without: Fit, found: Fit, log_p: Callable[[float], float], most: float) -> bool:
+    def may_be(self, effect: Effect, without: Fit, found: Fit, log_p: Callable[[float], float], maximum: float) -> bool:
         """Whether an effect of a fit may be this error: it is small, and slow motion does not show it."""
         if not of_motion(effect) or without.objective - found.objective >= self.squares:
             return False
-        return log_p(_slow_squares(without, SLOW * self.cutoff_hz) - _slow_squares(found, SLOW * self.cutoff_hz)) > most
+        return log_p(_slow_squares(without, SLOW * self.cutoff_hz) - _slow_squares(found, SLOW * self.cutoff_hz)) > maximum
 
 
 def _taken(effect: Effect, theta: Theta, found: Fit) -> float:
@@ -149,27 +149,26 @@ def _taken(effect: Effect, theta: Theta, found: Fit) -> float:
     return float(sum((log.whiten(taken)[log.rows(found.part)] ** 2).sum() for log, taken in each))
 
 
-def _slow_squares(found: Fit, most_hz: float) -> float:
+def _slow_squares(found: Fit, max_hz: float) -> float:
     """Squares of white residuals up to a frequency."""
     total = 0.0
     for log, residual in zip(found.logs, found.residuals, strict=True):
         rows = residual[log.rows(found.part)]
         f_hz = np.fft.rfftfreq(len(rows), log.pair.period_s * log.whiten.every)
-        total += 2.0 * float((np.abs(np.fft.rfft(rows, axis=0)[(f_hz > 0.0) & (f_hz < most_hz)]) ** 2).sum()) / len(rows)
+        total += 2.0 * float((np.abs(np.fft.rfft(rows, axis=0)[(f_hz > 0.0) & (f_hz < max_hz)]) ** 2).sum()) / len(rows)
     return total
 
 
-def with_low_pass_error(selection: Selection, error: LowPassError, left: Mapping[str, float]) -> Selection:
+def with_low_pass_error(selection: Selection, error: LowPassError, gains: Mapping[str, float]) -> Selection:
     """Selection with a low-pass less sure, by the gains of effects that show its error."""
-    shown = {name: gain for name, gain in left.items() if gain < error.size}
+    shown = {name: gain for name, gain in gains.items() if gain < error.size}
     if not shown:
         return selection
     share = SEEN_ERROR * float(np.sqrt(max(shown.values()) / error.size))
     return replace(
         selection,
         selected=tuple(
-            replace(one, std=np.hypot(one.std, share * one.theta)) if one.effect.name in LOW_PASSES else one
-            for one in selection.selected
+            replace(e, std=np.hypot(e.std, share * e.theta)) if e.effect.name in LOW_PASSES else e for e in selection.selected
         ),
         within_error=tuple(shown),
     )

@@ -48,7 +48,7 @@ class Selection:
         if not self.within_error:
             return ()
         names = ", ".join(name.replace("_", " ") for name in self.within_error)
-        named = any(one.effect.name in LOW_PASSES for one in self.selected)
+        named = any(e.effect.name in LOW_PASSES for e in self.selected)
         which = "the low-pass" if named else "a low-pass, without which the simulation is noisier than the recording"
         why = f"may be the error of {which} (the samples of a simulation alias its vibrations)"
         return (f"{names}: more than chance, but {why}, so not among the findings",)
@@ -61,5 +61,5 @@ def without(found: Selection, keys: Collection[str]) -> Selection:
         for before in (found.fitted, found.whole)
     )
     theta = {effect.key: value for effect, value in whole.chosen}
-    kept = (replace(one, theta=theta[one.effect.key]) for one in found.selected if one.effect.key not in keys)
+    kept = (replace(e, theta=theta[e.effect.key]) for e in found.selected if e.effect.key not in keys)
     return replace(found, selected=tuple(kept), fitted=fitted, whole=whole)

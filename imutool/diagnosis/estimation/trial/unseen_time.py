@@ -22,15 +22,15 @@ def first_refuted(fitted: Fit, first: int) -> int:
     blocks may lie behind it: the constant is that of the blocks that were fitted.
     """
     (other, hidden), exact = _fit_of_others(fitted), all(log.pair.exact for log in fitted.logs)
-    left = max(1.0, fitted.reduced_chi_square)
+    misfit = max(1.0, fitted.reduced_chi_square)
     nameless = [k for k, (effect, _) in enumerate(fitted.chosen) if effect.kind != "catalogue" and not exact]
 
     def p_value(left_out: Sequence[int]) -> float:
         directions = ((fitted, other),) if hidden.intersection(left_out) else ((fitted, other), (other, fitted))
-        both = [(one, without_effects(one, left_out, first), unseen.part) for one, unseen in directions]
+        both = [(f, without_effects(f, left_out, first), unseen.part) for f, unseen in directions]
         once = any(sets_in(fitted.chosen[k][0]).any() for k in left_out)
-        blocks = np.concatenate([held_out_gains(one, others, part, one.part if once else part) for one, others, part in both])
-        return min(held_out_p_value(blocks[:, 0]), prediction_p_value(blocks, left) if exact else 1.0)
+        blocks = np.concatenate([held_out_gains(f, others, part, f.part if once else part) for f, others, part in both])
+        return min(held_out_p_value(blocks[:, 0]), prediction_p_value(blocks, misfit) if exact else 1.0)
 
     for k in range(first, len(fitted.chosen)):
         tested = [[k], nameless] if k in nameless and len(nameless) > 1 else [[k]]
@@ -62,13 +62,13 @@ def held_out_p_value(gained: Float64[np.ndarray, " b"]) -> float:
     return min(float(student.sf(z, len(gained) - 1)), ranks)
 
 
-def prediction_p_value(blocks: Float64[np.ndarray, "b 2"], left: float) -> float:
+def prediction_p_value(blocks: Float64[np.ndarray, "b 2"], misfit: float) -> float:
     """p-value of held-out noise following a prediction u under H0.
 
-    Then 2 u.n - |u|² has mean -|u|² and variance 4 |u|² times `left`, the reduced chi-square of what has no explanation.
+    Then 2 u.n - |u|² has mean -|u|² and variance 4 |u|² times `misfit`, the reduced chi-square of what has no explanation.
     """
     gain, size = blocks.sum(axis=0)
-    return float(norm.sf((gain + size) / (2.0 * np.sqrt(left * size)))) if size > 0 else 1.0
+    return float(norm.sf((gain + size) / (2.0 * np.sqrt(misfit * size)))) if size > 0 else 1.0
 
 
 def held_out_gains(fitted: Fit, others: Chosen, part: str, constant_of: str) -> Float64[np.ndarray, "b 2"]:
@@ -79,7 +79,7 @@ def held_out_gains(fitted: Fit, others: Chosen, part: str, constant_of: str) -> 
     out, block_s = [], fitted.logs[0].pair.settings.search.held_out_block_s
     for log, forward, residual in zip(fitted.logs, fitted.passes, fitted.residuals, strict=True):
         other = log.residual(ForwardPass(log.pair, others, forward).blocks, (forward.blocks, residual))
-        with_, without = (_white(log, one, part, constant_of) for one in (residual, other))
+        with_, without = (_white(log, corrected, part, constant_of) for corrected in (residual, other))
         block = np.floor(log.pair.stamp_s[:: log.whiten.every][log.rows(part)] / block_s).astype(int)
         each = np.stack([(without**2).sum(1) - (with_**2).sum(1), ((without - with_) ** 2).sum(1)], axis=1)
         names, inverse = np.unique(block, return_inverse=True)

@@ -71,57 +71,57 @@ class Trial:
         """Log p-value that a finding needs after the correction."""
         return float(np.log(self.settings.false_discovery_rate / self.tried))
 
-    def tested(self, now: Fit) -> Selection:
+    def tested(self, base: Fit) -> Selection:
         """Selection of the effects that pass on all rows and on held-out blocks."""
-        while len(now.chosen) > (first := len(self.always)):
-            _ = (now := with_bias_walk(with_onsets_of_all_rows(now))).jacobians  # which both processes need
-            self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
-            unseen = Forked(partial(first_refuted, now, first))
-            whole = fit(now.logs, now.chosen, part="all", near=now)
+        while len(base.chosen) > (first := len(self.always)):
+            _ = (base := with_bias_walk(with_onsets_of_all_rows(base))).jacobians  # which both processes need
+            self.progress(f"on unseen time: {', '.join(base.keys[first:])}")
+            unseen = Forked(partial(first_refuted, base, first))
+            whole = fit(base.logs, base.chosen, part="all", near=base)
             if (reduced := plausible_part(whole.chosen, self.settings.implausible_factor)) is not None:
-                now = fit(now.logs, reduced)
+                base = fit(base.logs, reduced)
                 unseen.end()
                 continue
-            whole, self.onset_std = estimate_onsets(now.logs, whole, "all", max(1.0, whole.reduced_chi_square))
+            whole, self.onset_std = estimate_onsets(base.logs, whole, "all", max(1.0, whole.reduced_chi_square))
             self.walk_std = std_of_unseen_walk(whole)
             verdicts = self.verdicts(whole, first, unseen)
             unseen.end()
-            rates = [*(verdict.false_discovery_rate for verdict in verdicts), 1.0][: len(now.chosen) - first]
+            rates = [*(verdict.false_discovery_rate for verdict in verdicts), 1.0][: len(base.chosen) - first]
             worst = max(range(len(rates)), key=lambda k: rates[k])
             if rates[worst] <= self.settings.false_discovery_rate:
-                fitted = replace(now, chosen=with_onsets_of(now.chosen, whole.chosen))
+                fitted = replace(base, chosen=with_onsets_of(base.chosen, whole.chosen))
                 selected = tuple(sorted(verdicts, key=lambda verdict: -verdict.gain))
-                best = Selection(selected, fitted, whole, self.tried, first, partial(self._similar, now))
-                return self._with_error(best, now)
-            now = fit(now.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
-        return Selection((), now, fit(now.logs, now.chosen, part="all"), self.tried, first)
+                best = Selection(selected, fitted, whole, self.tried, first, partial(self._similar, base))
+                return self._with_error(best, base)
+            base = fit(base.logs, (*base.chosen[: first + worst], *base.chosen[first + worst + 1 :]), near=base)
+        return Selection((), base, fit(base.logs, base.chosen, part="all"), self.tried, first)
 
     def _similar(self, tested: Fit) -> dict[str, tuple[str, ...]]:
-        now = self._with_own_noise(tested)
-        return {now.keys[k]: tuple(self.rivals(k, now)) for k in range(len(self.always), len(now.chosen))}
+        base = self._with_own_noise(tested)
+        return {base.keys[k]: tuple(self.rivals(k, base)) for k in range(len(self.always), len(base.chosen))}
 
     def _with_own_noise(self, tested: Fit) -> Fit:
-        """The fit beside a constant bias."""
+        """The fit given a constant bias."""
         return tested if all(log.whiten.walk is None for log in tested.logs) else fit(self.logs, tested.chosen)
 
     def _with_error(self, selection: Selection, tested: Fit) -> Selection:
         """The selection with effects that explain more than chance and may be the error of its low-pass."""
         if (error := LowPassError.of(tested)) is None:
             return selection
-        now, count = self._with_own_noise(tested), self.settings.fitted_each_round
+        base, count = self._with_own_noise(tested), self.settings.fitted_each_round
         plain = tuple(effect for effect in self.named if not effect.variant)
-        clear = (one for one in self.candidates.ranked(now, plain, count)[:count] if one.log_p < self.threshold)
-        return with_low_pass_error(selection, error, {one.effect.name: one.gain for one in clear if of_motion(one.effect)})
+        clear = (s for s in self.candidates.ranked(base, plain, count)[:count] if s.log_p < self.threshold)
+        return with_low_pass_error(selection, error, {s.effect.name: s.gain for s in clear if of_motion(s.effect)})
 
-    def rivals(self, k: int, now: Fit) -> dict[str, Fit]:
+    def rivals(self, k: int, base: Fit) -> dict[str, Fit]:
         """Fits with another effect on the same sensor in the place of one that leave as little (AIC)."""
-        found, most, (mine, theta) = dict[str, Fit](), self.settings.rivals, now.chosen[k]
-        without = fit(self.logs, others := (*now.chosen[:k], *now.chosen[k + 1 :]), iterations=2, near=now)
-        least, aic = self.settings.rival_share * (without.objective - now.objective), now.objective + 2 * len(theta)
+        found, maximum, (own_effect, theta) = dict[str, Fit](), self.settings.rivals, base.chosen[k]
+        without = fit(self.logs, others := (*base.chosen[:k], *base.chosen[k + 1 :]), iterations=2, near=base)
+        minimum, aic = self.settings.rival_share * (without.objective - base.objective), base.objective + 2 * len(theta)
         named = tuple(effect for effect in self.named if effect.lagless is None or not effect.constants)  # one order of a name
-        for _, effect, start, promised in self.candidates.ranked(without, named, most)[:most]:
-            if effect.name != mine.name and effect.meets(mine) and promised > least:
-                trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - least)
+        for _, effect, start, promised in self.candidates.ranked(without, named, maximum)[:maximum]:
+            if effect.name != own_effect.name and effect.meets(own_effect) and promised > minimum:
+                trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - minimum)
                 if leaves_as_little(trial, effect.key, aic):
                     found.setdefault(effect.name, trial)
         return found
@@ -143,12 +143,12 @@ class Trial:
             if verdict is None:
                 break
             verdicts.append(verdict)
-        gains, names = {one.effect.key: one.gain for one in verdicts}, {effect.key: effect.name for effect, _ in whole.chosen}
-        left = {whole.keys[k]: k for k in range(passed.start + len(verdicts), len(whole.chosen))}
+        gains, names = {e.effect.key: e.gain for e in verdicts}, {effect.key: effect.name for effect, _ in whole.chosen}
+        remaining = {whole.keys[k]: k for k in range(passed.start + len(verdicts), len(whole.chosen))}
 
         def with_left(iterations: int | None) -> dict[str, float]:
             return gains | {
-                key: gain_of(whole, k, iterations)[0] for key, k in left.items() if FOLLOWING & {names[one] for one in gains}
+                key: gain_of(whole, k, iterations)[0] for key, k in remaining.items() if FOLLOWING & {names[e] for e in gains}
             }
 
         def hidden(every: Mapping[str, float]) -> frozenset[str]:
@@ -159,9 +159,9 @@ class Trial:
         if hidden(with_left(0)):  # no fit of the others leaves more than its start
             every = with_left(None)
             below = frozenset(key for key in hidden(every) if not self._shown_elsewhere(key, every, whole))
-        below |= {one.effect.key for one in verdicts if self._may_be_error(one.effect, whole)}
-        below |= {one.effect.key for one in verdicts if below_reference_error(one.effect, one.gain, whole)}
-        below |= {one.effect.key for one in verdicts if exact and is_part_of_misfit(one.effect, one.gain, whole)}
+        below |= {e.effect.key for e in verdicts if self._may_be_error(e.effect, whole)}
+        below |= {e.effect.key for e in verdicts if below_reference_error(e.effect, e.gain, whole)}
+        below |= {e.effect.key for e in verdicts if exact and is_part_of_misfit(e.effect, e.gain, whole)}
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in below else verdict for verdict in verdicts]
 
     def _shown_elsewhere(self, key: str, gains: Mapping[str, float], whole: Fit) -> bool:
@@ -219,13 +219,13 @@ def _off_other_peaks(whole: Fit, k: int, inflation: float) -> Theta:
     Motion far below f0 shows share / f0^2 and share zeta / f0^3. What rings shows f0 itself, and a weak ringing fits noise at
     many f0, each of them a narrow peak.
     """
-    (effect, theta), least, off = whole.chosen[k], whole.objective, [np.zeros(len(whole.chosen[k][1]))]
-    squares = [least]
+    (effect, theta), minimum, off = whole.chosen[k], whole.objective, [np.zeros(len(whole.chosen[k][1]))]
+    squares = [minimum]
     for ratio in OTHER_F0:
         begun = (effect, theta * np.array([ratio, ratio, *[ratio**2] * (len(theta) - 2)]))
         others = (*whole.chosen[:k], begun, *whole.chosen[k + 1 :])
-        there = fit(whole.logs, others, part=whole.part, give_up_above=least + AS_LIKELY * inflation)
-        squares.append(there.objective)
-        off.append(there.chosen[k][1] - theta)
+        at_other_peak = fit(whole.logs, others, part=whole.part, give_up_above=minimum + AS_LIKELY * inflation)
+        squares.append(at_other_peak.objective)
+        off.append(at_other_peak.chosen[k][1] - theta)
     likely = np.exp((min(squares) - np.array(squares)) / (2.0 * inflation))
     return np.asarray(np.sqrt(likely @ np.array(off) ** 2 / likely.sum()))

@@ -26,10 +26,10 @@ def with_bias_walk(found: Fit) -> Fit:
     for k, (log, forward) in enumerate(zip(plain, found.passes, strict=True)):
         jacobians = Jacobians([log.whiten], [forward], found.chosen)
         for axes, steps, each in _walks(log, log.residual(forward.blocks), partial(jacobians.on_axis, 0)):
-            likely = sum((one.of_any_noise() for one in each), start=np.zeros(len(steps)))
+            likely = sum((likelihood.of_any_noise() for likelihood in each), start=np.zeros(len(steps)))
             best = _likeliest(likely)
             if 2.0 * (likely[best] - likely[0]) > log.pair.settings.search.clearly_better:
-                walks[k][axes] = steps[best] * np.array([one.white()[best] for one in each])
+                walks[k][axes] = steps[best] * np.array([likelihood.white()[best] for likelihood in each])
     if not any(walk.any() for walk in walks) and all(log.whiten.walk is None for log in found.logs):
         return found
     logs = [replace(log, whiten=replace(log.whiten, walk=walk)) for log, walk in zip(plain, walks, strict=True)]
@@ -47,17 +47,17 @@ def std_of_unseen_walk(found: Fit) -> dict[str, Axes]:
     for k, log in enumerate(found.logs):
         in_noise, rows = log.whiten.walk, log.rows(found.part)
         for axes, steps, each in _walks(log, found.residuals[k], partial(found.jacobians.on_axis, k)):
-            likely = sum((one.of_any_noise() for one in each), start=np.zeros(len(steps)))
+            likely = sum((likelihood.of_any_noise() for likelihood in each), start=np.zeros(len(steps)))
             if (in_noise is not None and in_noise[axes].any()) or int(np.argmax(likely)) == len(steps) - 1:
                 continue
             weight = softmax(likely)
-            for axis, one in zip(axes.tolist(), each, strict=True):
+            for axis, likelihood in zip(axes.tolist(), each, strict=True):
                 where, J = found.jacobians.on_axis(k, axis, rows)
                 constant = direction(log.constants[rows, axis])
                 moves = np.zeros((len(where), len(rows)))
                 moves[:, rows] = J - np.outer(J @ constant, constant)
                 moves = np.cumsum(moves[:, ::-1], axis=1)  # by a step at each row, which all later ones keep
-                middle[where[:, None], where] += float(weight @ (steps * one.white())) * moves @ moves.T
+                middle[where[:, None], where] += float(weight @ (steps * likelihood.white())) * moves @ moves.T
     moved = found.covariance @ middle @ found.covariance
     out = {}
     for effect, theta in found.chosen:
@@ -84,8 +84,8 @@ def squares_of_walk(found: Fit, like: Fit, *, of_any_speed: bool = False) -> flo
         for axes, steps, each in _walks(log, found.residuals[k], on_axis, of_any_speed=of_any_speed):
             if log.whiten.walk is not None and log.whiten.walk[axes].any():
                 continue
-            noise = max([1.0, *([one.within for one in each] if of_any_speed else [like.reduced_chi_square])])
-            likely = sum((one.gain(noise) for one in each), start=np.zeros(len(steps)))
+            noise = max([1.0, *([likelihood.within for likelihood in each] if of_any_speed else [like.reduced_chi_square])])
+            likely = sum((likelihood.gain(noise) for likelihood in each), start=np.zeros(len(steps)))
             gained += 2.0 * noise * float(likely[int(np.argmax(likely)) if of_any_speed else _likeliest(likely)])
     return gained
 

@@ -99,13 +99,13 @@ def _visible_intervals(of_kind: Sequence[events.Event], data: RunData) -> list[t
 
     A widened interval ends half-way to the next event: many moments in a row are not one long event.
     """
-    least_ns = round(MIN_EVENT_SHARE * (data.end_ns - data.start_ns))
+    min_ns = round(MIN_EVENT_SHARE * (data.end_ns - data.start_ns))
     intervals = []
     for event, following in zip_longest(of_kind, of_kind[1:]):
         start_ns, end_ns = event.start_ns, event.end_ns
-        if end_ns - start_ns < least_ns:
-            start_ns = min(start_ns, data.end_ns - least_ns)
+        if end_ns - start_ns < min_ns:
+            start_ns = min(start_ns, data.end_ns - min_ns)
             half_way = data.end_ns if following is None else (event.end_ns + following.start_ns) // 2
-            end_ns = max(event.end_ns, min(start_ns + least_ns, half_way))
+            end_ns = max(event.end_ns, min(start_ns + min_ns, half_way))
         intervals.append((start_ns, end_ns))
     return intervals
