@@ -20,13 +20,13 @@ from imutool.bias.networks.temperature import temperature_tensors
 from imutool.bias.temperature import Scale
 from imutool.training.bias_spread import store_statistics, turn_on_prior
 from imutool.training.calibration.effect_selection import (
-    LINEAR,
     Calibration,
     effects_beyond_chance,
     parameter_columns,
 )
 from imutool.training.calibration.filter_settings import filter_settings
 from imutool.training.calibration.log_scatter import MIN_GAIN
+from imutool.training.calibration.normal_equations import LINEAR
 from imutool.training.calibration.shared_parameters import gain_of
 from imutool.training.log_signals import effects_turned_alike
 from imutool.training.settings import TrainSettings

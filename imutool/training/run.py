@@ -29,9 +29,10 @@ from imutool.mcap_io.storage.local import is_stream
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.training import checkpoint
-from imutool.training.calibration.effect_selection import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
+from imutool.training.calibration.effect_selection import DRIFTS, Calibration, PhysicsFirst, config_of
 from imutool.training.calibration.filter_settings import filter_settings
 from imutool.training.calibration.log_scatter import MIN_GAIN, SURELY
+from imutool.training.calibration.normal_equations import LINEAR
 from imutool.training.candidates import left_out_covariance, simpler_effects
 from imutool.training.fit import Epoch, Training, check_device, note
 from imutool.training.left_out import MIN_ERROR, beaten, compare

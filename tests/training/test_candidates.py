@@ -17,7 +17,8 @@ from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.write import write
 from imutool.recording import seconds
 from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
-from imutool.training.calibration.effect_selection import LINEAR, PhysicsFirst
+from imutool.training.calibration.effect_selection import PhysicsFirst
+from imutool.training.calibration.normal_equations import LINEAR
 from imutool.training.candidates import with_statistics
 from imutool.training.fit import Training
 from imutool.training.left_out import _score, _turned_as_poses

@@ -17,7 +17,8 @@ from imutool.evaluation import evaluate
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.sensor.made_up_flight import flight
-from imutool.training.calibration.effect_selection import LINEAR, calibrate
+from imutool.training.calibration.effect_selection import calibrate
+from imutool.training.calibration.normal_equations import LINEAR
 from imutool.training.left_out import Score, beaten, better_without, keep
 from imutool.training.log_agreement import Contradiction, check_axes, contradicting
 from imutool.training.run import train

@@ -33,7 +33,7 @@ from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import Load, Signals
 from imutool.training.calibration.log_scatter import MIN_GAIN, widest
-from imutool.training.calibration.normal_equations import FOLDS, Seen, Terms, folded, linearise
+from imutool.training.calibration.normal_equations import FOLDS, LINEAR, Seen, Terms, folded, linearise
 from imutool.training.calibration.shared_parameters import Problem, gain_of
 from imutool.training.fit import Epoch, note
 from imutool.training.log_signals import effects_turned_alike, loaded_signals, signals_of
@@ -43,7 +43,6 @@ from imutool.units import SENSORS, Sensor
 
 BY_CHANCE = 0.01  # probability of finding any effect where there is none
 DRIFTS = dict.fromkeys(("gyro_warm_up", "gyro_rate_load", "gyro_force_load", *temperature.EFFECTS), 0.3)  # they look alike
-LINEAR: Mapping[Sensor, tuple[str, ...]] = {sensor: (f"{sensor}_misalignment", f"{sensor}_scale") for sensor in SENSORS}
 CONTAINED = {"rate_curve": "gyro_scale"}  # a curve imitates a scale, which then needs evidence as any other effect
 UNSEEN = 0.9  # of its prior's width: a parameter no narrower was not seen
 

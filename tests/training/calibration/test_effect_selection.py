@@ -15,8 +15,8 @@ from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm, compiled
 from imutool.sensor.signals import SignalFilter
-from imutool.training.calibration.effect_selection import LINEAR, Calibration, calibrate
-from imutool.training.calibration.normal_equations import FOLDS, design_effect, folded
+from imutool.training.calibration.effect_selection import Calibration, calibrate
+from imutool.training.calibration.normal_equations import FOLDS, LINEAR, design_effect, folded
 from imutool.training.candidates import CANDIDATES, best_predicted
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Pool
@@ -120,6 +120,17 @@ def test_an_effect_far_beyond_its_prior_is_not_held_back_by_it(flights: list[Rec
     effects = catalogue.trained("gyro", ["gyro_g_sensitivity"])
     calibration = found(flights, "gyro", effects, ["gyro_g_sensitivity"], of_plausible=10.0)
     np.testing.assert_allclose(calibration.theta.numpy(), planted_theta(effects, 10.0), rtol=0.05)
+
+
+def test_an_axis_that_reads_the_opposite_of_the_motion_is_found_as_a_scale(flights: list[Recording]) -> None:
+    """The prior says 5 %, which holds back a scale of 2 where the axis turns little, as on a floor."""
+    driven = [planar(flight, pitch_rad=1e-3) for flight in flights]
+    opposite = [replace(drive, imu=replace(drive.imu, gyro=drive.imu.gyro * (1.0, -1.0, 1.0))) for drive in driven]
+    pool = Pool.of([measured(flight, (), np.zeros(0), seed) for seed, flight in enumerate(opposite)])
+    calibration = calibrate(pool, "gyro", pool.gyro)
+    assert set(calibration.effects) == set(LINEAR["gyro"])
+    planted = [2.0 * (key == ("gyro_scale", "y")) for key in of_effects(calibration.effects, "gyro")]
+    np.testing.assert_allclose(calibration.theta.numpy(), planted, atol=0.15)
 
 
 def test_a_clock_that_all_flights_share_is_found(three: Callable[[int], list[Recording]]) -> None:
@@ -226,19 +237,19 @@ def test_logs_of_one_setup_share_errors_so_that_each_more_of_them_says_less(flig
     assert bool((std[1] < std[0]).all())
 
 
-def planar(recording: Recording) -> Recording:
-    """The heading of a flight, and nothing else: a robot on a flat floor."""
+def planar(recording: Recording, pitch_rad: float = 0.0) -> Recording:
+    """The heading of a flight, and nothing else: a robot on a flat floor, or one that pitches as it drives."""
     from scipy.spatial.transform import Rotation
 
     truth, imu = recording.truth, recording.imu
-    w_z = imu.gyro[:, 2]
-    dt = np.diff(seconds(imu.t_ns, int(imu.t_ns[0])))
-    heading = np.concatenate([[0.0], np.cumsum(0.5 * (w_z[1:] + w_z[:-1]) * dt)])
-    q_wb_wxyz = Rotation.from_euler("z", heading[:, None]).as_quat(scalar_first=True)
+    w_z, t_s = imu.gyro[:, 2], seconds(imu.t_ns, int(imu.t_ns[0]))
+    heading = np.concatenate([[0.0], np.cumsum(0.5 * (w_z[1:] + w_z[:-1]) * np.diff(t_s))])
+    pitch = pitch_rad * np.sin(3.0 * t_s)
+    q_wb_wxyz = Rotation.from_euler("ZY", np.stack([heading, pitch], axis=1)).as_quat(scalar_first=True)
     still = np.zeros((len(imu), 3))
     assert np.array_equal(truth.t_ns, imu.t_ns)
     poses = Poses(imu.t_ns, still, q_wb_wxyz, still)
-    gyro = np.stack([np.zeros(len(imu)), np.zeros(len(imu)), w_z], axis=1)
+    gyro = np.stack([-np.sin(pitch) * w_z, 3.0 * pitch_rad * np.cos(3.0 * t_s), np.cos(pitch) * w_z], axis=1)
     return replace(recording, imu=Imu(imu.t_ns, gyro, still + np.array([0.0, 0.0, 9.81])), truths={"/ground_truth/pose": poses})
 
 
