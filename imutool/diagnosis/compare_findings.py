@@ -24,6 +24,7 @@ from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.result import Curve, Estimate, Finding
 from imutool.diagnosis.wording.quantity import grouped, stated_parameters
 from imutool.sensor import catalogue
+from imutool.units import AXES
 
 ALIKE_STD = 4.5  # joint deviations: chance exceeds them in 0.5 % (Student's t of ten blocks, the largest of nine numbers)
 ALIKE_SHARE = (
@@ -45,6 +46,14 @@ def shared(finding: Finding, sim_findings: Sequence[Finding]) -> bool:
     """Whether the simulation has the same effect with the same numbers."""
     twin = _twin(finding, sim_findings)
     return twin is not None and _alike(finding, twin)
+
+
+def reversed_axes(findings: Sequence[Finding]) -> Iterator[str]:
+    """Remark on axes that read the opposite of the motion: an error of scale below -1 is none of a sensor."""
+    for finding in findings:
+        scales = finding.parameters if finding.effect in ("gyro_scale", "accel_scale") else {}
+        if axes := ", ".join(axis for axis, s in scales.items() if axis in AXES and s.value + s.std < -1.0):
+            yield f"{finding.signal} {axes}: it reads the opposite of the motion, as an axis that is reversed does"
 
 
 def is_of_digits(finding: Finding, digits: Finding) -> bool:
