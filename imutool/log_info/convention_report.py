@@ -25,6 +25,7 @@ from imutool.log_info.pose_imu_rotation import (
     CORRECTION,
     body_warnings,
     motion_warnings,
+    reversed_warnings,
     sparse_warnings,
     unlike,
     velocities_judged,
@@ -99,7 +100,7 @@ def _pose_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
     topic, turned_deg = whole.truth.topic, [] if turns.turned is None else turns.turned.deg.tolist()
     seen = turns.explained, turns.rms_rad_s, turns.jumps, turns.largest_jump_deg
     body = body_warnings(topic, turned_deg, turns.explained, turns.as_recorded)
-    return [*body, *motion_warnings(topic, *seen), *sparse]
+    return [*body, *reversed_warnings(topic, turns.reversed_axes), *motion_warnings(topic, *seen), *sparse]
 
 
 def lean_warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:
@@ -293,6 +294,7 @@ def truth_warnings(truths: Sequence[TruthInfo]) -> list[str]:
         as_recorded = truth.gyro_explained_as_recorded
         if isinstance(explained, float) and isinstance(as_recorded, float):
             warnings += body_warnings(truth.topic, truth.body_turned_deg or [], explained, as_recorded)
+        warnings += reversed_warnings(truth.topic, truth.gyro_reversed_axes or "")
         if isinstance(explained, float) and isinstance(rms, float) and isinstance(jumps, int) and isinstance(largest, float):
             warnings += motion_warnings(truth.topic, explained, rms, jumps, largest)
     return warnings

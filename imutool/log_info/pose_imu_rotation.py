@@ -10,7 +10,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.cleaning.samples import BLOCK
-from imutool.cleaning.truth import Truth, Turned, best_rotation, read_truth, rotation_deg, turning
+from imutool.cleaning.truth import Truth, Turned, best_rotation, read_truth, reversed_axes, rotation_deg, turning
 from imutool.geometry import quaternion
 from imutool.inertial.strapdown import velocity_follows
 from imutool.log_info.imu_samples import ImuSamples
@@ -18,6 +18,7 @@ from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.recording import GAP_FACTOR, Imu, Recording, seconds
 from imutool.recording.columns import median, quantile
+from imutool.units import AXES
 
 logger = logging.getLogger(__name__)
 
@@ -47,12 +48,13 @@ class Agreement(NamedTuple):
     turned: Turned | None  # None if the motion does not show it
     jumps: int  # steps of a tenth of a second in which the poses turn and the gyro does not
     largest_jump_deg: float
+    reversed_axes: str  # of the gyro, such as `y`
 
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> dict[str, float | str]:
         """Entries of a report on the poses."""
-        own = {"gyro_rms_rad_s": self.rms_rad_s, "gyro_explained": self.explained}
-        own |= {"gyro_explained_as_recorded": self.as_recorded}
-        return own | {"jumps": self.jumps, "largest_jump_deg": self.largest_jump_deg}
+        own: dict[str, float | str] = {"gyro_rms_rad_s": self.rms_rad_s, "gyro_explained": self.explained}
+        own["gyro_explained_as_recorded"] = self.as_recorded
+        return own | {"jumps": self.jumps, "largest_jump_deg": self.largest_jump_deg, "gyro_reversed_axes": self.reversed_axes}
 
 
 class GyroTurns:
@@ -148,7 +150,8 @@ def _agreement(
     body = rotation_deg(turn, gyro[kept], omega[kept], float(end[-1] - begin[0])) if seen else None
     if body is not None and body.std_deg.max() >= np.clip(UNSURE_SHARE * np.linalg.norm(body.deg), *UNSURE_DEG):
         body = None
-    return Agreement(rms, explained, as_recorded, body, len(jumps), float(jumps.max(initial=0.0)))
+    opposite = reversed_axes(gyro[kept], omega[kept]) if seen else ""
+    return Agreement(rms, explained, as_recorded, body, len(jumps), float(jumps.max(initial=0.0)), opposite)
 
 
 def turned_somehow(explained: float, as_recorded: float) -> bool:
@@ -163,9 +166,15 @@ def body_warnings(topic: str, turned_deg: Sequence[float], explained: float, as_
         text = f"the poses {topic} turn as the gyro does only with their body turned, and the motion does not show how"
         return [f"{text}: turns about one axis, as of a vehicle; {BY_HAND}"]
     deg = float(np.linalg.norm(turned_deg))
-    return (
-        [f"the body of the poses {topic} is turned by {deg:.0f}° against the gyro; {CORRECTION}"] if _is_far(turned_deg) else []
-    )
+    text = f"the body of the poses {topic} is turned by {deg:.0f}° against the gyro; {CORRECTION}"
+    return [text] if _is_far(turned_deg) else []
+
+
+def reversed_warnings(topic: str, axes: str) -> list[str]:
+    """Warning of axes of the gyro that read the opposite of the turns of poses; one for all axes exists already."""
+    what = f"the gyro reads turns about {', '.join(axes)} with the opposite sign of the poses {topic}: its axes are left-handed"
+    fix = "Reverse them in the source (of a table, --map gyro=gx,-gy,gz)"
+    return [f"{what}. {fix}"] if 0 < len(axes) < len(AXES) else []
 
 
 def _is_far(turned_deg: Sequence[float] | Float64[np.ndarray, " 3"]) -> bool:

@@ -112,6 +112,7 @@ class TruthInfo(Section, frozen=True):
     ends_before_s: float | UnsetType = UNSET
     gyro_rms_rad_s: float | UnsetType = UNSET  # what the poses do not explain of the log's first gyro
     gyro_explained: float | UnsetType = UNSET  # share of its motion that they do, with their body turned to fit best
+    gyro_reversed_axes: str | UnsetType = UNSET  # that read the opposite of the poses' rates, such as `y`
     gyro_explained_as_recorded: float | UnsetType = UNSET  # the same with their body as it is; below zero, they contradict it
     jumps: int | UnsetType = UNSET  # steps of a tenth of a second in which the poses turn and the gyro does not
     largest_jump_deg: float | UnsetType = UNSET

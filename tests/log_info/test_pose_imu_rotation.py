@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imutool.cleaning.truth import Truth
-from imutool.log_info.pose_imu_rotation import agreement, body_warnings, motion_warnings, sparse_warnings
+from imutool.log_info.pose_imu_rotation import agreement, body_warnings, motion_warnings, reversed_warnings, sparse_warnings
 from imutool.recording import Imu, Poses
 
 RNG = np.random.default_rng(6)
@@ -63,6 +63,24 @@ def test_poses_that_turn_about_one_axis_show_no_mount() -> None:
     assert found is not None
     assert found.explained > 0.8
     assert found.turned is None
+
+
+@pytest.mark.parametrize("reversed_axes", ["", "y", "x"])
+def test_an_axis_of_the_gyro_that_is_reversed_is_named_although_it_hardly_turns(reversed_axes: str) -> None:
+    """A robot on a floor pitches and rolls a little; no turned body reads one axis alone the other way."""
+    rng = np.random.default_rng(3)
+    small = np.stack([np.sin(T), 0.01 * np.sin(4.0 * T), 0.01 * np.cos(3.1 * T)], axis=1)
+    turned, error = Rotation.from_euler("ZYX", small), Rotation.from_rotvec(1e-3 * rng.normal(size=(len(T[::20]), 3)))
+    skew = turned.inv().as_matrix() @ np.gradient(turned.as_matrix(), T, axis=0)  # R^T dR/dt = [omega]x
+    gyro = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
+    gyro *= [-1.0 if axis in reversed_axes else 1.0 for axis in "xyz"]
+    t_ns = START_NS + np.rint(T * 1e9).astype(np.int64)
+    truth = Truth("/pose", t_ns[::20], np.zeros((len(T[::20]), 3)), (turned[::20] * error).as_quat(scalar_first=True))
+    found = agreement(truth, Imu(t_ns, gyro, np.tile([0.0, 0.0, 9.81], (len(T), 1))))
+    assert found is not None
+    assert found.reversed_axes == reversed_axes
+    warnings = [warning for warning in reversed_warnings("/pose", found.reversed_axes) if "left-handed" in warning]
+    assert len(warnings) == len(reversed_axes)
 
 
 def test_a_gap_of_the_imu_counts_for_nothing():

@@ -87,7 +87,10 @@ class Terms(NamedTuple):
         prior = np.concatenate([np.zeros(0), *map(sensors.std_of, effects)]) ** -2.0
         names = [effect.name for effect in effects for _ in effect.parameters]
         linear = [k for k, name in enumerate(names) if any(name in of_sensor for of_sensor in LINEAR.values())]
-        return cls(*(torch.from_numpy(x).to(pool.t) for x in (terms_of(effects, signals), patterns(effects), prior)), linear)
+        values, pattern, precision = (
+            torch.from_numpy(x).to(pool.t) for x in (terms_of(effects, signals), patterns(effects), prior)
+        )
+        return cls(values, pattern, precision, linear)
 
 
 class WindowSet(NamedTuple):
