@@ -126,7 +126,7 @@ def best_rotation(gyro: Float64[np.ndarray, "n 3"], omega: Float64[np.ndarray, "
 
 
 def reversed_axes(gyro: Float64[np.ndarray, "n 3"], omega: Float64[np.ndarray, "n 3"]) -> str:
-    """Axes of a gyro that read the opposite of true rates, if its axes are left-handed; empty without evidence.
+    """Axes of a left-handed gyro that read the opposite of true rates; empty without evidence.
 
     No turned body explains a reflection. The smallest singular value of the cross-covariance has to exceed `SURE_REFLECTED`
     standard deviations: a robot on a floor hardly turns about two of its axes.

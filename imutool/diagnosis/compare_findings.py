@@ -48,8 +48,8 @@ def shared(finding: Finding, sim_findings: Sequence[Finding]) -> bool:
     return twin is not None and _alike(finding, twin)
 
 
-def reversed_axes(findings: Sequence[Finding]) -> Iterator[str]:
-    """Remark on axes that read the opposite of the motion: an error of scale below -1 is none of a sensor."""
+def _reversed_axes(findings: Sequence[Finding]) -> Iterator[str]:
+    """Remark on axes that read the opposite of the motion: no sensor has an error of scale below -1."""
     for finding in findings:
         scales = finding.parameters if finding.effect in ("gyro_scale", "accel_scale") else {}
         if axes := ", ".join(axis for axis, s in scales.items() if axis in AXES and s.value + s.std < -1.0):
@@ -76,7 +76,7 @@ def is_of_simulation(digits: Finding, pairs: Sequence[Pair]) -> bool:
 
 
 def remarks(findings: Sequence[Finding], sim_findings: Sequence[Finding]) -> Iterator[str]:
-    """What the simulation has of its own: alike, in another size, or alone."""
+    """Effects that the simulation shares or has alone, and axes that are reversed."""
     matched = []
     for finding in findings:
         twin = _twin(finding, sim_findings)
@@ -90,6 +90,7 @@ def remarks(findings: Sequence[Finding], sim_findings: Sequence[Finding]) -> Ite
     for twin in sim_findings:
         if twin not in matched:
             yield f"{_words(twin)}: the simulation has it ({_numbers(twin)}), the recording does not show it"
+    yield from _reversed_axes(findings)
 
 
 def contradictions(logs: Sequence[WhitenedLog], selection: Selection) -> Iterator[str]:

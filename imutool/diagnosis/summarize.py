@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.diagnosis.compare_findings import contradictions, is_of_digits, is_of_simulation, remarks, reversed_axes, shared
+from imutool.diagnosis.compare_findings import contradictions, is_of_digits, is_of_simulation, remarks, shared
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, without_effects
@@ -98,7 +98,6 @@ def summarize(
             *contradictions(logs, selection),
             *dict.fromkeys(_remarks(pairs, selection)),
             *_resting(pairs, hidden),
-            *reversed_axes(findings),
             *both_have,
         ),
         closer=gains(logs, before, after),

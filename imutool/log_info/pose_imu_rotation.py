@@ -171,7 +171,7 @@ def body_warnings(topic: str, turned_deg: Sequence[float], explained: float, as_
 
 
 def reversed_warnings(topic: str, axes: str) -> list[str]:
-    """Warning of axes of the gyro that read the opposite of the turns of poses; one for all axes exists already."""
+    """Warning of axes of the gyro that read the opposite of poses; other rules find all three."""
     what = f"the gyro reads turns about {', '.join(axes)} with the opposite sign of the poses {topic}: its axes are left-handed"
     fix = "Reverse them in the source (of a table, --map gyro=gx,-gy,gz)"
     return [f"{what}. {fix}"] if 0 < len(axes) < len(AXES) else []

@@ -26,10 +26,9 @@ from imutool.training.calibration.effect_selection import (
 )
 from imutool.training.calibration.filter_settings import filter_settings
 from imutool.training.calibration.log_scatter import MIN_GAIN
-from imutool.training.calibration.normal_equations import LINEAR
 from imutool.training.calibration.shared_parameters import gain_of
 from imutool.training.log_signals import effects_turned_alike
-from imutool.training.settings import TrainSettings
+from imutool.training.settings import LINEAR, TrainSettings
 from imutool.training.training_windows import Pool, without_motion
 from imutool.units import Sensor
 

@@ -38,11 +38,10 @@ from imutool.processes.forked import of_each
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
 from imutool.training.calibration.effect_selection import Calibration, parameter_columns
 from imutool.training.calibration.log_scatter import MIN_GAIN, SURELY
-from imutool.training.calibration.normal_equations import LINEAR
 from imutool.training.candidates import CANDIDATES, best_predicted, known, left_out_effects, left_out_model, with_statistics
 from imutool.training.log_agreement import Contradiction, check_axes, contradicting
 from imutool.training.log_signals import without_nuisances
-from imutool.training.settings import TrainSettings
+from imutool.training.settings import LINEAR, TrainSettings
 from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 

@@ -19,7 +19,7 @@ from imutool.inertial.windows import HUBER_MEDIANS, huber_weight, rotation_resid
 from imutool.recording import nanoseconds
 from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.calibration.effect_selection import Calibration, parameter_columns
-from imutool.training.calibration.normal_equations import LINEAR
+from imutool.training.settings import LINEAR
 from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 

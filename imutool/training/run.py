@@ -32,14 +32,13 @@ from imutool.training import checkpoint
 from imutool.training.calibration.effect_selection import DRIFTS, Calibration, PhysicsFirst, config_of
 from imutool.training.calibration.filter_settings import filter_settings
 from imutool.training.calibration.log_scatter import MIN_GAIN, SURELY
-from imutool.training.calibration.normal_equations import LINEAR
 from imutool.training.candidates import left_out_covariance, simpler_effects
 from imutool.training.fit import Epoch, Training, check_device, note
 from imutool.training.left_out import MIN_ERROR, beaten, compare
 from imutool.training.log_agreement import warn_of_smoothed_poses
 from imutool.training.log_signals import matrix_covariance, read_parts, with_poses_of_sensor
 from imutool.training.objectives.paper_scheme import PaperTraining
-from imutool.training.settings import TrainSettings, settings_for
+from imutool.training.settings import LINEAR, TrainSettings, settings_for
 from imutool.training.training_windows import Pool, check_trainable
 from imutool.units import SENSORS, Sensor
 

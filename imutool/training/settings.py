@@ -22,6 +22,7 @@ from imutool.units import SENSORS, Sensor
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
+LINEAR: Mapping[Sensor, tuple[str, ...]] = {sensor: (f"{sensor}_misalignment", f"{sensor}_scale") for sensor in SENSORS}
 MIN_RESIDUAL = 1e-6  # rad or m/s: no truth is better, and perfect data must not outweigh the prior beyond float64's digits
 
 

@@ -10,7 +10,7 @@ import pytest
 from support import planted
 from support.diagnoses import replace
 
-from imutool.diagnosis.compare_findings import ANOTHER_MOTION, is_of_digits, remarks, reversed_axes, shared
+from imutool.diagnosis.compare_findings import ANOTHER_MOTION, is_of_digits, remarks, shared
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
 from imutool.errors import DataError
@@ -54,7 +54,7 @@ def test_numbers_are_alike_within_what_the_two_are_sure_of_and_what_poses_can_te
 
 def test_a_scale_below_minus_one_is_named_as_an_axis_that_is_reversed() -> None:
     """So the gyro of FETCH reads about y, by whose rates a diagnosis once said a scale of -180 % and no more."""
-    (remark,) = reversed_axes([finding("lever_arm", x=-2.0), finding(x=-0.9, std=0.01), finding(x=-1.8, std=0.3)])
+    (remark,) = remarks([finding("lever_arm", x=-2.0), finding(x=-0.9, std=0.01), finding(x=-1.8, std=0.3)], [])
     assert remark == "gyro x: it reads the opposite of the motion, as an axis that is reversed does"
 
 

@@ -18,12 +18,11 @@ from imutool.mcap_io.write import write
 from imutool.recording import seconds
 from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
 from imutool.training.calibration.effect_selection import PhysicsFirst
-from imutool.training.calibration.normal_equations import LINEAR
 from imutool.training.candidates import with_statistics
 from imutool.training.fit import Training
 from imutool.training.left_out import _score, _turned_as_poses
 from imutool.training.run import train
-from imutool.training.settings import settings_of
+from imutool.training.settings import LINEAR, settings_of
 from imutool.training.training_windows import Pool
 from imutool.units import SENSORS
 

@@ -18,11 +18,10 @@ from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.training.calibration.effect_selection import calibrate
-from imutool.training.calibration.normal_equations import LINEAR
 from imutool.training.left_out import Score, beaten, better_without, keep
 from imutool.training.log_agreement import Contradiction, check_axes, contradicting
 from imutool.training.run import train
-from imutool.training.settings import settings_of
+from imutool.training.settings import LINEAR, settings_of
 from imutool.training.training_windows import Pool
 
 KIND = Switchings(sensor_seed=0, rest_s=10.0, duration_s=30.0, rate_hz=50.0)

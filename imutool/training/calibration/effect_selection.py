@@ -33,11 +33,11 @@ from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import Load, Signals
 from imutool.training.calibration.log_scatter import MIN_GAIN, widest
-from imutool.training.calibration.normal_equations import FOLDS, LINEAR, Seen, Terms, folded, linearise
+from imutool.training.calibration.normal_equations import FOLDS, Seen, Terms, folded, linearise
 from imutool.training.calibration.shared_parameters import Problem, gain_of
 from imutool.training.fit import Epoch, note
 from imutool.training.log_signals import effects_turned_alike, loaded_signals, signals_of
-from imutool.training.settings import SensorPrior, TrainSettings
+from imutool.training.settings import LINEAR, SensorPrior, TrainSettings
 from imutool.training.training_windows import Part, Pool
 from imutool.units import SENSORS, Sensor
 

@@ -27,9 +27,9 @@ from imutool.sensor.signals import Signals
 from imutool.training.calibration.closed_form import end_samples, median_per_log, nuisance_jacobian, window_sets
 from imutool.training.calibration.log_scatter import LogPieces, shown_by_logs, sums_by_log, widest
 from imutool.training.calibration.shared_parameters import Equations, Problem
-from imutool.training.settings import SensorPrior
+from imutool.training.settings import LINEAR, SensorPrior
 from imutool.training.training_windows import Part, Pool
-from imutool.units import SENSORS, Sensor
+from imutool.units import Sensor
 
 WINDOW_S: Mapping[Sensor, tuple[float, ...]] = {"gyro": (1.0, 4.0, 15.0, 40.0), "accel": (0.5, 2.0, 5.0)}
 JUDGED_FROM_S: Mapping[Sensor, float] = {"gyro": 4.0, "accel": 2.0}  # drift over short windows does not rank calibrations
@@ -40,7 +40,6 @@ SHARED = 0.5  # correlation of the errors that poses of one setup share from log
 SETTLED, MAX_STEPS = 0.2, 40  # deviations by which a step moves a parameter at most; steps with windows of all lengths
 WEAK = 0.01  # of a prior's precision, that of the prior at first
 SURE = 2.0  # standard deviations by which a scale exceeds that of an axis with nothing but noise
-LINEAR: Mapping[Sensor, tuple[str, ...]] = {sensor: (f"{sensor}_misalignment", f"{sensor}_scale") for sensor in SENSORS}
 FOLDS = 3  # parts of a log where there are fewer logs than this
 
 

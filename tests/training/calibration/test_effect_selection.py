@@ -16,9 +16,9 @@ from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm, compiled
 from imutool.sensor.signals import SignalFilter
 from imutool.training.calibration.effect_selection import Calibration, calibrate
-from imutool.training.calibration.normal_equations import FOLDS, LINEAR, design_effect, folded
+from imutool.training.calibration.normal_equations import FOLDS, design_effect, folded
 from imutool.training.candidates import CANDIDATES, best_predicted
-from imutool.training.settings import SensorPrior
+from imutool.training.settings import LINEAR, SensorPrior
 from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 
