@@ -20,6 +20,7 @@ from imutool.errors import DataError, required
 from imutool.recording.message_log import MessageTopic
 
 HEADER, TIME, DURATION = "std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 EMPTY_CDR = b"\0\1\0\0\0"  # ROS 2 gives a message without fields one byte
 NAME = 2  # rosbags' kind of field: another message

@@ -17,7 +17,7 @@ import numpy as np
 from imutool.recording.joined_imu import unit_by_gravity
 
 from ._table_names import unit_named
-from ._table_text import Columns
+from ._table_text import LOOKED_AT, Columns
 from ._table_times import rises, units_of_time, usual_step
 from ._table_units import GYRO_SI, TIME_NS, gravity_units
 
@@ -31,7 +31,6 @@ ROS_IMU = [  # `ros2 topic echo --csv` of sensor_msgs/Imu
     *(f"linear_acceleration.{axis}" for axis in "xyz"),
     *(f"linear_acceleration_covariance{place}" for place in SQUARE),
 ]
-LOOKED_AT = 200  # first lines, which show the words between the numbers
 MIN_ROWS, MIN_SHARE = 5, 0.3  # of the lines looked at that have the same words; status lines may stand between
 MIN_TENTH = 0.5  # of the median length, which 90 % of an accelerometer's readings exceed
 MIN_NUMBERS, MIN_LABELS = 4, 2  # in a row

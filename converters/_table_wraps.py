@@ -10,6 +10,8 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
 
+from ._table_dates import LAST_NS
+
 WORD_SIZES = 2**8, 2**16, 2**32  # at which a counter begins again
 MAX_OF_WORD = 0.9  # of its size, by which a counter falls where it begins again
 MAX_SKIPPED = 0.1  # share of its size by which the last of a counter may miss it
@@ -17,7 +19,6 @@ PARTS_OF_TIME = 60, 3600, 86_400, 604_800  # seconds of a minute, an hour, a day
 ENDS_S = 1, *PARTS_OF_TIME  # at which a time begins again
 ENDS = 2**16, 2**24, 2**31, 2**32  # counts, at which it does, too
 MAX_STEPS = 10.0  # usual steps across an end
-LAST_NS = 2**63 - 1
 PARTS_IN_UNITS = *(part * 1000**k for part in PARTS_OF_TIME for k in range(4)), 24  # s, ms, us, ns; hours
 SIZES = *(2**k for k in range(4, 33)), *(10**k for k in range(10)), *PARTS_IN_UNITS  # at which a time or a counter begins again
 MIN_ROWS = 20  # of a recording, in the mean

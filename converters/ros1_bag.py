@@ -22,13 +22,12 @@ from imutool.errors import DataError, LogError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._ros_types import Ros1Types, ToCdr, need_rosbags, ros1_topic, ros2_name
+from ._ros_types import IMAGES, Ros1Types, ToCdr, need_rosbags, ros1_topic, ros2_name
 from ._source import find_files
 
 GENERAL = True
 SUFFIXES = (".bag", ".active")
 BUFFER_BYTES = 64 << 20  # of messages wait for earlier ones in later chunks
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 
 
 class _Route(NamedTuple):

@@ -22,13 +22,12 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence, mcap_log
-from ._ros_types import definition_from_files, need_rosbags, plain_cdr, ros2_definition
+from ._ros_types import IMAGES, definition_from_files, need_rosbags, plain_cdr, ros2_definition
 from ._source import find_files, find_folders, head, with_suffix
 from .mcap_log import METADATA, is_bag_folder
 
 GENERAL = True
 SQLITE = b"SQLite format 3\0"
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 LISTED = re.compile(r"relative_file_paths:\s*\n((?:\s*- .*\n)+)")
 STATED = r"{}:[ \t]*['\"]?\w"  # a text of metadata.yaml that is not empty
 MALFORMED = (ValueError, KeyError, TypeError, AttributeError, AssertionError)  # of metadata that rosbags does not check

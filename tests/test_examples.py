@@ -72,7 +72,7 @@ def test_a_data_set_becomes_debiased_logs_with_smaller_errors(tmp_path: Path, ex
 def test_a_model_is_trained_on_given_logs(tmp_path: Path, example: Example) -> None:
     for seed in (1, 2):
         write(flight(seed, duration_s=13.0, rate_hz=100.0), tmp_path / f"{seed}.mcap")
-    words = ["steps=2", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]"]
+    words = ["steps=2", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]", "compare=false"]
     printed = example("train_on_your_logs.py", "m.safetensors", "1.mcap", "2.mcap", *words)
     assert "gyro    2/2" in printed
     assert "nan" not in printed

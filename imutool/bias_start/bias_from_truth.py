@@ -26,6 +26,7 @@ from imutool.cleaning.rules.saturation import at_limit
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
+from imutool.inertial.windows import HUBER_MEDIANS
 from imutool.log_info.convention_report import check_start_poses
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
 from imutool.recording.columns import median
@@ -46,7 +47,6 @@ PARTS, CONTRADICTED = 3, 22.5  # of a start; chi-square of their scatter on thre
 MIN_TRUTH_STD = np.array([5e-5] * 3 + [2e-3] * 3)  # rad/s and m/s²: no poses show a bias better
 ITERATIONS = 4
 MAX_TURN_RAD = 2.0  # by a bias: a turn is known up to pi, so that of a larger bias begins near the median of its steps
-HUBER_MEDIANS = 1.5  # threshold of an outlier, in medians of the residuals
 
 Rows = Float64[np.ndarray, "n 3"]
 Quaternions = Float64[np.ndarray, "n 4"]

@@ -267,6 +267,18 @@ def test_the_stream_goes_by_real_stamps(build: MakeModel, segment: MakeSegment) 
         assert 0 < apart < 2 * jitter_s / model.config.drift_step_s * largest(rest_path(model, seen)[sensor]), sensor
 
 
+def test_the_rest_dynamics_are_the_derivative_of_the_drift(build: MakeModel) -> None:
+    model = lively(build).frozen()
+    F, still, step = model.rest_dynamics(), np.zeros(3), 1e-6
+    for sensor, columns in COLUMNS.items():
+        ends = [
+            [model.drift(sensor)(model.prior_mean[columns] + d, still, still) for d in s * step * np.eye(3)] for s in (1, -1)
+        ]
+        expected = (np.subtract(*ends) / (2.0 * step)).T
+        assert np.abs(expected).max() > 1e-6
+        np.testing.assert_allclose(F[columns, columns], expected, rtol=1e-5, atol=1e-9)
+
+
 # ── the paper's joint equation ───────────────────────────────────────────────────────────────────────────────────────
 
 

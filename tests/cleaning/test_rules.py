@@ -12,6 +12,7 @@ from support.imu_defects import batch_of, late, pick, repeated, with_values, wit
 from imutool.cleaning.finding import Finding
 from imutool.cleaning.rule import CleaningSettings
 from imutool.cleaning.rules import saturation
+from imutool.cleaning.rules.time_back import Epoch, left_out
 from imutool.cleaning.survey import Survey, examine
 from imutool.cleaning.truth import Truth
 from imutool.mcap_io.codec.decode import ImuBatch
@@ -493,3 +494,8 @@ def test_a_clipped_and_calibrated_axis_is_a_finding(made):
     assert one.rule == "saturation"
     assert one.values == {"axis": "gyro.y", "limit": pytest.approx(5.0, rel=1e-3)}
     assert "clipped before a calibration" in one.what
+
+
+def test_a_pause_between_two_settings_of_a_clock_counts_as_no_samples() -> None:
+    epochs = [Epoch(0, 10, 0, 10, 10), Epoch(10, 25, 5, 20, 15), Epoch(25, 37, 11, 16, 12)]
+    assert left_out(epochs, 40) == [(10, 25), (37, 40)]  # 10 + 12 samples, and not 10 and the last two thirds of 15

@@ -424,8 +424,10 @@ def test_a_folder_that_was_not_made_here_is_never_removed(log: Path, tmp_path: P
         with pytest.raises(ConfigError, match=rf"holds {Path(name) if '7' not in name else 'mav0/cam7'}, which this export"):
             export(log, original, format=format, overwrite=True)
         (original / name).unlink()
-    with pytest.raises(ConfigError, match="not a folder"):
-        export(log, log, format=format, overwrite=True)
+    (link := tmp_path / "link").symlink_to(original, target_is_directory=True)
+    for target in (log, link):
+        with pytest.raises(ConfigError, match="not a folder"):
+            export(log, target, format=format, overwrite=True)
 
 
 def test_the_log_is_never_in_the_folder_that_is_replaced(log: Path, tmp_path: Path) -> None:

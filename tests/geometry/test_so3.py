@@ -194,6 +194,7 @@ def test_quaternions_and_matrices_are_one_another_s_inverse_and_agree_with_scipy
     unit = q / np.linalg.norm(q)
     R = so3.matrix_from_quaternion_wxyz(torch.from_numpy(q))
     assert np.abs(R.numpy() - Rotation.from_quat(q, scalar_first=True).as_matrix()).max() <= ROUNDINGS[torch.float64]
+    assert (so3.matrices_from_rows_wxyz(np.stack([q, unit])) - R).abs().max() <= ROUNDINGS[torch.float64]
     back = so3.quaternion_wxyz_from_matrix(R).numpy()
     assert back[0] >= 0
     assert min(np.abs(back - unit).max(), np.abs(back + unit).max()) <= ROUNDINGS[torch.float64]

@@ -53,6 +53,14 @@ def test_dependent_innovations_tell_less() -> None:
     assert np.sqrt((std**2).mean()) == pytest.approx(values.std(), rel=CORRELATED)
 
 
+def test_the_deviation_is_newey_and_wests() -> None:
+    S, d = np.tile(np.eye(3), (2, 1, 1)), np.array([[1.0, 0.0, 0.0]] * 2)
+    e = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    scores, weight = (0.5, -0.5), 1.0 - 1.0 / 7.0  # of a lag of one among six
+    variance = scores[0] ** 2 + scores[1] ** 2 + 2.0 * weight * scores[0] * scores[1]
+    assert share_of_correction(Innovations(e, S), Innovations(e - d, S)) == pytest.approx((0.5, math.sqrt(variance) / 2.0))
+
+
 def test_a_jolt_does_not_decide() -> None:
     rng = np.random.default_rng(6)
     S = np.tile(np.eye(3), (BLOCKS, 1, 1))

@@ -17,6 +17,7 @@ from support.nees import consistency
 
 from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.inertial.metrics import absolute, evaluate, write_tum
+from imutool.inertial.scoring.absolute_errors import AbsoluteErrors
 from imutool.inertial.scoring.alignment import align
 from imutool.inertial.scoring.relative_errors import pairs_by_distance
 from imutool.recording import Poses
@@ -222,6 +223,14 @@ def test_what_the_data_do_not_determine_is_none() -> None:
     assert figures["aoe_deg"] == pytest.approx(0.0, abs=1e-6)
     line = Poses(truth.t_ns, np.arange(200)[:, None] * [0.1, 0.0, 0.0], truth.q_wb_wxyz)
     assert absolute(line, line, mask)["ape_aligned_m"] is None
+
+
+def test_a_path_whose_last_block_turns_at_the_origin_has_positions() -> None:
+    path, errors = wander(200, seed=11), AbsoluteErrors()
+    errors.add(path, path)
+    at_origin = Poses(path.t_ns + 10**10, np.zeros_like(path.p_wb), path.q_wb_wxyz, np.zeros_like(path.p_wb))
+    errors.add(at_origin, at_origin)
+    assert errors.figures(lambda: iter(()))["ape_m"] == 0.0
 
 
 def test_one_pose_has_absolute_figures_only() -> None:

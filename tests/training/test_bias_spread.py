@@ -119,7 +119,7 @@ def test_a_steady_drive_is_no_stop() -> None:
 def test_a_walk_is_found_where_the_poses_show_it(
     walk: float, truth_noise: float, minimum: float, maximum: float, tmp_path: Path
 ) -> None:
-    kind = Switchings(truth_noise=truth_noise, walk_rad_s2_rthz=walk, rest_s=5.0, duration_s=40.0)
+    kind = Switchings(truth_noise=truth_noise, walk_rad_s2_rthz=walk, rest_s=5.0, duration_s=40.0, rate_hz=50.0)
     paths = [tmp_path / f"{seed}.mcap" for seed in range(4)]
     for seed, path in enumerate(paths):
         write(log(seed, 0, kind), path)

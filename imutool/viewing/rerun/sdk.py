@@ -69,7 +69,7 @@ def rerun_version() -> str:
     return str(rr.__version__)
 
 
-def scopes(logs: Sequence[RunData], root: Scope = ()) -> list[Scope]:
+def scopes(logs: Sequence[RunData], root: Scope) -> list[Scope]:
     """Scope of each log: the root for one log, `run/NAME` below it for several."""
     if len(logs) == 1:
         return [root]

@@ -87,14 +87,15 @@ def test_a_log_that_changes_after_its_chunks_were_kept_is_refused(foreign: Forei
     assert not (tmp_path / "out.mcap").exists()
 
 
+@pytest.mark.parametrize("named", ["zstd", "unchunked"])
 def test_a_large_log_has_a_digest_of_what_states_its_contents(
-    foreign: Foreign, flight: Messages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    foreign: Foreign, flight: Messages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str
 ) -> None:
     def digest(path: Path) -> dict[str, str]:
         with Log(path) as log, SourceDigest(log.index, path) as found:
             return found.result()
 
-    one, other = foreign(flight, "zstd"), tmp_path / "other.mcap"
+    one, other = foreign(flight, named), tmp_path / "other.mcap"
     *rest, payload = flight[5]
     other.write_bytes(one.read_bytes())
     assert digest(one) == digest(other)
@@ -104,4 +105,4 @@ def test_a_large_log_has_a_digest_of_what_states_its_contents(
     assert stated == digest(other)
     assert list(stated) == ["source_digest"]
     changed = [*flight[:5], (*rest, bytes([*payload[:-1], payload[-1] ^ 1])), *flight[6:]]
-    assert digest(foreign(changed, "zstd")) != stated
+    assert digest(foreign(changed, named)) != stated

@@ -195,7 +195,7 @@ def test_pieces_of_a_log_differ_in_their_rest_bias(data: Data) -> None:
 
 def test_a_bias_that_wanders_over_a_long_log_is_no_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Made-up sensors warm up with a time constant of 20 s, and their bias wanders."""
-    logs = [flight(seed, duration_s=900.0, rate_hz=50.0) for seed in (3, 4)]
+    logs = [flight(seed, duration_s=500.0, rate_hz=50.0) for seed in (3, 4)]
     still = [log.scalars["/ground_truth/bias/gyro"].values for log in logs]
     warm_up = np.mean([bias[0] - bias[100 * 50] for bias in still], axis=0)  # but for a share of 7e-3, and the wander
     pool, errors = Pool.of(logs), []

@@ -66,7 +66,7 @@ def std_of_unseen_walk(found: Fit) -> dict[str, Axes]:
     return out
 
 
-def squares_of_walk(found: Fit, like: Fit, *, of_any_speed: bool = False) -> float:
+def squares_of_walk(found: Fit, like: Fit, *, of_any_speed: bool) -> float:
     """Squares that random walks of the biases explain of a fit's residual.
 
     They are twice the gain in log-likelihood, and what the fit itself did not reach; none of a sensor whose noise has its walk

@@ -26,7 +26,7 @@ def log_comparison(logs: Sequence[RunData], to: rr.RecordingStream) -> None:
     to.log("compare", rr.TextDocument(comparison(logs), media_type="text/markdown"), static=True, strict=True)
 
 
-def markdown(data: RunData, more: Sequence[str] = ()) -> str:
+def markdown(data: RunData, more: Sequence[str]) -> str:
     """Report on one log as Markdown; `more` are sentences after the log's own notes."""
     lines = [f"# {escape(data.name)}", ""]
     lines += [f"{data.duration_s:.1f} s, read {' and '.join(escape(trace.name) for trace in data.traces)}.", ""]
