@@ -6,9 +6,10 @@ import re
 
 import numpy as np
 
-from ._table_groups import TRUE_GROUPS, shared_group
+from ._table_groups import shared_group
 from ._table_map import RATE_TO_STATE, Entries, Proposal, column_named
-from ._table_names import TIME_WORDS, XSENS_TIME, name_and_unit, spaced_name, unit_named
+from ._table_names import OWN_TIME, TIME_WORDS, XSENS_TIME, name_and_unit, spaced_name, unit_named
+from ._table_pose_names import TRUE_GROUPS
 from ._table_text import Columns
 from ._table_times import (
     MAX_SKIPPED,
@@ -31,7 +32,6 @@ from ._table_wraps import begun_anew
 
 MAX_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
 SENSOR_TIME = r"(sensor|event|hardware|hw)_?(event_?)?(time|t_|ts|stamp)"  # Android's, beside the time of the program
-OWN_TIME = {"gyro": r"gyro?(scope)?_t", "accel": r"acc(el(eration|erometer)?)?_t"}  # names of a sensor's own stamps begin so
 
 
 def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns: Columns, given: Entries) -> None:
@@ -47,7 +47,8 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
         _propose_time_unit(proposal, given["time"], names, columns)
         return
     spelled = {c: (name or unit, spaced_name(c)) for c, (name, unit) in names.items()}
-    found = [c for c, each in spelled.items() if any(re.fullmatch(rf"(.*_)?{TIME_WORDS}", name) for name in each)]
+    forms = rf"(.*_)?{TIME_WORDS}|{OWN_TIME['gyro']}|{OWN_TIME['accel']}"
+    found = named = [c for c, each in spelled.items() if any(re.fullmatch(forms, name) for name in each)]
     others = [c for c in found if length not in (None, len(columns.values[c])) and rises(columns.values[c])]
     found = [c for c in found if length in (None, len(columns.values[c]))]
     still, found = [c for c in found if not goes_on(columns.values[c])], [c for c in found if goes_on(columns.values[c])]
@@ -78,9 +79,8 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
     if in_batches(columns.values[column]):
         several = len(columns.values[column]) / len(np.unique(columns.values[column]))
         proposal.reasons.append(f"{column!r} has a stamp for {several:.3g} rows each in the mean")
-    if re.match(OWN_TIME["gyro"], spelled[column][1]):
-        own = [c for c in found if re.match(OWN_TIME["accel"], spelled[c][1]) and names[c][1] == names[column][1]]
-        proposal.entries |= {"accel_time": own[0]} if own else {}
+    if own := _accel_time([c for c in named if names[c][1] == names[column][1]], column, spelled, columns, proposal):
+        proposal.entries["accel_time"] = own
     elif times := _repeated_times(found, columns, proposal):
         proposal.entries |= times
         column = times["time"]
@@ -89,6 +89,19 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
         proposal.hints.append(
             f"rate_hz = {RATE_TO_STATE} and counter = {column!r}  # in place of time and time_unit, if it counts samples"
         )
+
+
+def _accel_time(named: list[str], time: str, spelled: dict[str, tuple[str, str]], columns: Columns, proposal: Proposal) -> str:
+    """Time of the accelerometer's own, by its name beside that of the gyro, or by its rows; else empty."""
+    accel = proposal.unsigned("accel", columns)
+    count = len(columns.values[accel[0]]) if accel else 0
+    fits = [c for c in named if c != time and len(columns.values[c]) == count and goes_on(columns.values[c])]
+    own = [c for c in fits if re.match(OWN_TIME["accel"], spelled[c][1])]
+    if count != len(columns.values[time]):
+        own = own or (fits if len(fits) == 1 else [])
+    elif not re.match(OWN_TIME["gyro"], spelled[time][1]):
+        own = []
+    return next(iter(own), "")
 
 
 def _count_at(proposal: Proposal, columns: Columns, given: Entries, length: int) -> None:

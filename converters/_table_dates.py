@@ -49,11 +49,21 @@ CLOCK = re.compile(  # of one day or, as Excel shows times, of one hour; 15:04:0
 )
 
 
+SPAN = re.compile(  # 0 days 00:00:00.010000, of pandas; 0.01 sec, of MATLAB
+    r"(?P<days>-?\d+) days?(?: \+?(?P<h>\d\d):(?P<m>\d\d):(?P<s>\d\d(?:\.\d+)?))?"
+    r"|(?P<number>-?\d+(?:\.\d+)?) (?P<unit>sec|min|hr)s?"
+)
+SPAN_S = {"sec": 1.0, "min": 60.0, "hr": 3600.0}
+
+
 def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]] | None:
     """Nanoseconds since 1970 of dates, with notes; None for other texts.
 
     Clocks without a date count from the first midnight. Of 4/5/2026 the month is the first number, unless one exceeds 12 there.
     """
+    spans = [SPAN.fullmatch(text) for text in texts] if texts and SPAN.fullmatch(texts[0]) else []
+    if spans and all(spans):
+        return np.array([_nanoseconds(match) for match in spans if match], np.int64), ["its durations count from a start"]
     if texts and NAMED.match(texts[0]):
         texts = [NAMED.sub(lambda m: f"{m[3]}-{MONTHS.index(m[2].lower()) + 1}-{m[1]}", text) for text in texts]
     if texts and COMPACT.match(texts[0]):
@@ -83,6 +93,14 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
     if slashes:
         notes.append(f"its dates count as {'day/month' if day_first else 'month/day'}/year")
     return np.array(stamps, np.int64), notes
+
+
+def _nanoseconds(span: re.Match[str]) -> int:
+    """Nanoseconds of a duration."""
+    if span["number"]:
+        return round(float(span["number"]) * SPAN_S[span["unit"]] * 1e9)
+    hours = 24 * int(span["days"]) + int(span["h"] or 0)
+    return (hours * 60 + int(span["m"] or 0)) * 60 * 10**9 + round(float(span["s"] or 0.0) * 1e9)
 
 
 def clock_of_numbers(values: np.ndarray) -> Int64[np.ndarray, " n"] | None:

@@ -26,11 +26,11 @@ from ._table_names import TIME_WORDS, group_of, leaf_of, split_name, tells_apart
 from ._table_numbers import is_number
 from ._table_numpy import load_npy, load_npz
 from ._table_packed import goes_back, read_bytes, text_head
-from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated, state_mip
+from ._table_programs import GYROFLOW, of_labview, of_vectornav, scale_gyroflow, scale_stated, state_mip
 from ._table_sensors import read_rows
 from ._table_sheets import load_sheets
 from ._table_text import FIRSTS, Columns, add_fields, is_text_table, read_csv, text_of
-from ._table_times import join_gps_weeks, read_clocks_and_days
+from ._table_times import fill_own_times, join_gps_weeks, read_clocks_and_days
 
 NO_NUMBERS = "holds no columns of numbers"
 MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own in HDF5
@@ -90,6 +90,7 @@ def load(path: Path, kind: str) -> Columns:
     read_clocks_and_days(columns)
     settle_zones(columns)
     sort_by_clock(columns)
+    fill_own_times(columns)
     add_gravity(columns)
     if not columns.values:
         why = "".join(f"; {loss}" for loss in columns.remarks.losses[:1])
@@ -150,7 +151,7 @@ def read_text(text: str, columns: Columns, path: Path) -> None:
     if read_mocap(text, columns, path):
         return
     (echoed, cut), (long, few) = of_echo(text), long_table(text, path)
-    if table := echoed or long or of_vectornav(text, columns):
+    if table := echoed or long or of_labview(text) or of_vectornav(text, columns):
         read_csv(table, columns, path)
         columns.remarks.notes.extend(["a long table: its signals became columns"] if long else [])
         columns.remarks.losses.extend([f"{cut} messages without all fields of the first are left out"] if cut else [])

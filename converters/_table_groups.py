@@ -16,6 +16,7 @@ from ._table_pose_names import (
     NUMBERS,
     POSITIONS,
     QUATERNION,
+    TRUE_GROUPS,
     angles_of,
     axes_of,
     bodies_of,
@@ -24,6 +25,7 @@ from ._table_pose_names import (
     numbered_quaternion,
     pose_leaves,
     position_of,
+    without_true,
 )
 from ._table_rotations import EITHER_WAY, TURNS, angles_by_motion, matrix_by_motion, order_by_motion, seconds_of
 from ._table_text import Columns, matrix_columns
@@ -35,9 +37,6 @@ CALIBRATED = r"(?i)\bcalibrated\b"  # in the name of a group, beside one of raw 
 MAX_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 MIN_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
 MAX_LONGER = 10.0  # is a span of time than another in the same unit
-TRUE_GROUPS = (
-    r"(data_?)?(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)(_?data)?\d*"
-)
 
 
 def imus_apart(columns: Columns) -> dict[str, Columns]:
@@ -125,7 +124,7 @@ def _bodies(columns: Columns, time: str, unit: str) -> Iterator[tuple[tuple[str,
         in_rows = (time, unit) if len(columns.values[column]) == len(columns.values[time]) else None
         beside = time_beside(columns, column, time, unit, separate=True) or in_rows
         if beside is not None:
-            name = re.sub(rf"^{TRUE_GROUPS}_", "", leaf)
+            name = without_true(leaf)
             groups.setdefault((beside, is_true(column) or name != leaf), {}).setdefault(owner, {})[name] = column
     for (clock, named_true), owners in groups.items():
         plain = owners.pop("", {})

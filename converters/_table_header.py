@@ -56,6 +56,13 @@ def header_of(lines: list[str], delimiter: str | None, width: int, first: list[s
     return names, dict(zip(names, units, strict=True)) if units else {}
 
 
+def without_numbers_of_columns(lines: list[str], delimiter: str | None) -> list[str]:
+    """Lines without a first one of 0, 1, 2, ..., which pandas writes above unnamed columns."""
+    (row,) = fields_of(lines[:1], delimiter) or [[]]
+    counted = [text.strip().strip('"') for text in (row if any(row[:1]) else row[1:])]  # above an index stands none
+    return lines[1:] if len(counted) > 3 and counted == [*map(str, range(len(counted)))] else lines
+
+
 def units_in_comments(lines: Iterable[str], names: list[str]) -> dict[str, list[str]]:
     """Columns by the unit that a comment states: `gx/gy/gz=deg/s`, `ax, ay, az in g`."""
     spelled, found = {name.lower(): name for name in names}, dict[str, list[str]]()

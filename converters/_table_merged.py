@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 
 from ._table_map import IMU_GROUP
-from ._table_names import TIME_WORDS, name_and_unit, split_name
+from ._table_names import TIME_WORDS, name_and_unit, spaced_name, split_name, triples
 from ._table_pose_names import has_turns, pose_leaves, position_of
 from ._table_sensors import SENSORS
 from ._table_text import Columns
@@ -133,7 +133,8 @@ def settle_zones(columns: Columns) -> None:
             name, unit = name_and_unit(column, columns.units.get(column, ""))
             if column in columns.local_times or len(values) != len(dates) or not re.fullmatch(SINCE_1970, name or unit):
                 continue
-            times = values.astype(float)
+            if not np.isfinite(times := values.astype(float)).all():
+                continue
             units = [unit] if unit in TIME_NS else units_of_time(float(times[0]), usual_step(times))
             times = times * TIME_NS[units[0]] if len(units) == 1 else np.zeros(len(times))
             if not SINCE_NS < times.min() <= times.max() < LAST_S * NS:
@@ -166,6 +167,7 @@ def sort_by_clock(columns: Columns) -> None:
         return
     if any(rows.all() for rows in clocks.values()):
         _cut_blocks(columns, known, clocks)
+        _cut_held(columns, {c: named[c]["before"] for c in clocks if named[c]["before"]}, clocks)
         return
     timed = np.any([*clocks.values()], axis=0)
     if any((rows & ~timed).any() for rows in known.values()):
@@ -213,6 +215,35 @@ def _cut_blocks(columns: Columns, known: dict[str, np.ndarray], clocks: dict[str
             separate.units[groups[column]] = columns.units.get(column) or name_and_unit(column, "")[1]
     columns.remarks.notes.append(f"each of {', '.join(clocks)} is the time of the columns behind it, and of as many rows")
     columns.values, columns.units, columns.texts = separate.values, separate.units, separate.texts
+
+
+def _cut_held(columns: Columns, before: dict[str, str], clocks: dict[str, np.ndarray]) -> None:
+    """Give an IMU that the rows of faster samples repeat, time and all, its own rows and a group: `imu_t`, `imu_gx`, ....
+
+    Joins of tables leave it so (`pandas.merge_asof`).
+    """
+    different = {clock: len(np.unique(columns.values[clock])) for clock in clocks if clock in columns.values}
+    finest, apart = max(different, key=lambda clock: different[clock], default=""), Columns()
+    spelled = {c: name_and_unit(c, columns.units.get(c, ""))[0] for c in columns.values}
+    for clock in [c for c in before if 1 < different.get(c, 0) < different[finest]]:
+        is_still = np.diff(columns.values[clock].astype(float)) == 0.0
+        steps = ((c, np.diff(columns.values[c])) for c in spelled if spelled[c].startswith(f"{before[clock]}_"))
+        of = [c for c, each in steps if not each[is_still].any()]
+        names, spaced = {c: spelled[c] for c in of}, {c: spaced_name(c) for c in of}
+        if finest in of or not all(triples(sensor, names, spaced) for sensor in ("gyro", "accel")):
+            continue
+        rows = np.concatenate([[True], ~is_still]) & clocks[clock]
+        for column in sorted(of, key=lambda c: c != clock):
+            _take_rows(columns, column, rows, apart, f"{before[clock]}/{'time' if column == clock else column}")
+            del spelled[column]
+        apart.units[f"{before[clock]}/time"] = columns.units.get(clock) or name_and_unit(clock, "")[1]
+        columns.remarks.notes.append(f"{is_still.sum()} rows repeat the samples beside {clock!r}, which are taken once")
+    for column in spelled if apart.values else ():
+        group, name = before.get(finest) or finest, "time" if column == finest else column
+        _take_rows(columns, column, clocks[finest], apart, f"{group}/{name}")
+        apart.units |= {f"{group}/time": columns.units.get(finest) or name_and_unit(finest, "")[1]} if column == finest else {}
+    if apart.values:
+        columns.values, columns.units, columns.texts = apart.values, apart.units, apart.texts
 
 
 def _take_rows(columns: Columns, column: str, rows: np.ndarray, into: Columns, name: str) -> None:

@@ -13,18 +13,25 @@ TIME_WORDS = (
     r"|zeit|zeitstempel|uhrzeit|date_?time|utc|[a-z]*(nanos|micros|millis)|elapsed|(gps_?)?(tow|time_?of_?week))"
     r"(_since_?(boot|reboot|start|epoch|1970))?"
 )
+BEHIND = r"(t|ts|times?|timestamps?|time_stamps?)_"
+OWN_TIME = {  # names of a sensor's own stamps begin so: gyro_time, acc_ts; or are t_gyro, timeAcc
+    "gyro": rf"gyro?(scope)?_t|{BEHIND}gyro?(scope)?$",
+    "accel": rf"acc(el(eration|erometer)?)?_t|{BEHIND}acc(el(eration|erometer)?)?$",
+}
+SECOND, PER, SQUARED = r"s(ec(ond)?)?", r"(\^?-|⁻)", r"([ _]?(\^|\*\*)?2|²|[ _]?squared|/s(ec)?)"
+SAME_MARKS = str.maketrans("μº", "µ°")  # a Greek letter, an ordinal
 UNITS = {
-    "rad/s": r"rad ?/ ?s|rads|rad[ .·]?s\^?-1|rps|rad_s|radps|rad(ian)?s?[ _]?(per|/)[ _]?s(ec(ond)?)?|rad_?sec(ond)?",
-    "deg/s": r"deg ?/ ?s|dps|degs|°/s|(deg|°)[ .·]?s\^?-1|deg_s|degps|deg(ree)?s?[ _]?(per|/)[ _]?s(ec(ond)?)?|deg_?sec(ond)?",
-    "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
-    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|mss|m[ .·]?s\^?-2|m_s_?2|m_?per_?s_?2",
-    "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²",
+    "rad/s": rf"rps|radps|rad(ian)?s?[ _]?(per|/)[ _]?{SECOND}|rad[ .·*]?s{PER}(1|¹)|rad_?{SECOND}",
+    "deg/s": rf"dps|degps|(deg(ree)?s?|°)[ _]?(per|/)[ _]?{SECOND}|(deg|°)[ .·*]?s{PER}(1|¹)|deg_?{SECOND}",
+    "mdeg/s": rf"mdps|mdegs|m(deg|°) ?/ ?{SECOND}",
+    "m/s^2": rf"m/\({SECOND}\^?2\)|mps2|ms2|mss|m[ .·*]?s{PER}(2|²)|(m|met(er|re)s?)(_|[ _]?(per|/)[ _]?){SECOND}{SQUARED}",
+    "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²|gals?",
     "ft/s^2": r"(ft|feet|foot)/s(ec)?((\^|\*\*)?2|²|/s(ec)?)|(ft|feet|foot)[ .·]?s\^?-2|fps\^?2|ft_?(per_?)?s_?2",
     "mg": r"mg|milli[ _-]?gs?",
-    "g": r"g'?s?",
-    "ns": r"ns|(n|nano)sec(ond)?s?",
-    "us": r"us|µs|(u|micro)sec(ond)?s?",
-    "ms": r"ms|(m|milli)sec(ond)?s?",
+    "g": r"g'?s?|g[ _-]?forces?",
+    "ns": r"ns|(n|nano)sec(ond)?s?|nanos",
+    "us": r"us|µs|(u|micro)sec(ond)?s?|micros",
+    "ms": r"ms|(m|milli)sec(ond)?s?|millis",
     "s": r"s|sec(ond)?s?",
     "min": r"min(ute)?s?",
     "h": r"h|hrs?|hours?",
@@ -43,7 +50,8 @@ MULTIPLES = {  # of a unit, by their names
     r"[uµμ]g|micro-?gs?": (1e-6, "g"),
 }
 RATE_OR_FORCE_UNITS = (
-    r"m?dps|(?:deg|rad)(?:_?(?:per_?)?s(?:ec(?:ond)?)?|ps)|mps2|ms2|mss|(?:m|ft)_(?:per_)?s_?2|mg|milli_?gs?"  # in a name
+    r"m?dps|(?:deg|rad)(?:_?s(?:ec(?:ond)?)?|ps)|(?:deg(?:ree)?|rad(?:ian)?)s?_?per_?s(?:ec(?:ond)?)?"
+    r"|mps2|ms2|mss|mg|milli_?gs?|m(?:et(?:er|re)s?)?_(?:per_)?s(?:ec(?:ond)?)?_?(?:2|squared)|ft_(?:per_)?s_?2"  # in a name
 )
 LENGTH_UNITS = (  # at the end of the name of a position or of a height
     r"(?:[a-z]*[xyz]|[ned]|east|north|up|down|alt(?:itude)?|height|hgt|elevation)(?:_in)?_(mm|cm|m|met(?:er|re)s?)"
@@ -183,7 +191,8 @@ def name_and_unit(column: str, beside: str) -> tuple[str, str]:
 
 def unit_named(text: str) -> str:
     """Unit that a text is; empty for other texts."""
-    return next((unit for unit, pattern in UNITS.items() if re.fullmatch(pattern, text.strip("[]").lower())), "")
+    plain = text.strip("[]").lower().translate(SAME_MARKS)
+    return next((unit for unit, pattern in UNITS.items() if re.fullmatch(pattern, plain)), "")
 
 
 def unit_with_factor(column: str, beside: str) -> tuple[float, str]:
@@ -209,7 +218,7 @@ def _spaced(column: str) -> str:
 
 def split_name(column: str) -> tuple[str, str]:
     """Name in lower case with underscores, and the unit in brackets or at the end."""
-    text = column.strip().lower()
+    text = column.strip().lower().translate(SAME_MARKS)
     for words, translated in CHINESE.items():
         text = text.replace(words, translated)
     bracket = re.search(r"[\[(]([^\])]*[a-zµ°][^\])]*)[\])]\s*$", text)

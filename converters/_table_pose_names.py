@@ -9,6 +9,10 @@ from ._table_geodetic import EASTING, LOCAL
 from ._table_names import DIGITS, TIME_WORDS, group_of, leaf_of, split_name
 from ._table_text import Columns
 
+TRUE_GROUPS = (
+    r"(data_?)?(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)(_?data)?\d*"
+)
+TRUE_BEHIND = r"((?<=^q)|_)(mocap|vicon|opti_?track|omc|qualisys|leica|ground_?truth|truth|true|gt)(_?ref(erence)?)?(?=_|$)"
 FRAMES = r"(_[a-z]{2})?"  # of a rotation or a position, as in q_wb, R_wb, p_wb
 ROTATION = rf"(q|quat|quaternion|orientation|rotation|attitude|ori|rot){FRAMES}_?"
 QUATERNION = rf"{ROTATION}(?P<axis>[wxyz])"
@@ -56,6 +60,12 @@ def pose_leaves(columns: Iterable[str]) -> dict[str, tuple[str, str]]:
     groups = {c: group_of(c) for c, leaf in leaves.items() if re.fullmatch("[wxyz]", leaf) and group_of(c) in alone - {""}}
     own = {c: (group_of(group), f"{split_name(leaf_of(group))[0]}_{leaves[c]}".lstrip("_")) for c, group in groups.items()}
     return {column: own.get(column, ("", leaf)) for column, leaf in leaves.items()}
+
+
+def without_true(leaf: str) -> str:
+    """Name of a column without its word for a true pose: `vicon_qw`, `px_gt`, `qVicon`."""
+    name = re.sub(rf"^{TRUE_GROUPS}_", "", leaf)
+    return name if name != leaf else re.sub(TRUE_BEHIND, "", leaf)
 
 
 def has_poses(columns: Columns) -> bool:

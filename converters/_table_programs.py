@@ -2,7 +2,8 @@
 
 Programs for MicroStrain's sensors put the number of MIP's field behind the names (`X Accel [x8004]`); each field has one unit.
 A VectorNav sensor writes sentences whose name says what is in them (`$VNIMU,...*66`), by its user manual. A log of Gyroflow
-(.gcsv) holds raw numbers, with their scales above the table: of time in s, gyro in rad/s, accel in g.
+(.gcsv) holds raw numbers, with their scales above the table: of time in s, gyro in rad/s, accel in g. A measurement file of
+LabVIEW (.lvm) has two headers above the names, the second with the units and the step of time.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ SENTENCES = {
 }
 MIP_UNITS = {"[x8004]": "g", "[x8005]": "rad/s"}  # of scaled accelerations and rates, by MicroStrain's protocol
 LOOKED_AT = 4096  # first characters of a text
+LABVIEW, END_OF_HEADER = "LabVIEW Measurement", "***End_of_Header***"
 GYROFLOW = "GYROFLOW IMU LOG"
 SCALES = {"tscale": ("t", "s"), "gscale": (r"g[xyz]", "rad/s"), "ascale": (r"a[xyz]", "g")}  # columns, and their unit after it
 
@@ -36,6 +38,23 @@ def of_vectornav(text: str, columns: Columns) -> str:
     if len(rows) < len(lines):
         columns.remarks.losses.append(f"{len(lines) - len(rows)} lines of other sentences are left out")
     return "\n".join([",".join(SENTENCES[match[1]]), *rows]) + "\n"
+
+
+def of_labview(text: str) -> str:
+    """Table of a measurement file of LabVIEW, its units in the names; empty for other texts."""
+    if not text.startswith(LABVIEW) or text.count(END_OF_HEADER) < 2:
+        return ""
+    file, section, table = text.split(END_OF_HEADER, 2)
+    separator = "," if re.search(r"^Separator\W+Comma", file, re.MULTILINE) else "\t"
+    stated = {line[0]: line[1:] for line in (line.split(separator) for line in section.splitlines())}
+    names, *rows = (line.split(separator) for line in table.split("\n", 1)[1].splitlines())
+    first = 1 if re.search(r"^X_Columns\W+No", file, re.MULTILINE) else 0  # its field in each row is empty
+    width = len(names) - (names[-1] == "Comment")
+    units = zip(names, ["s", *stated.get("Y_Unit_Label", [])], strict=False)
+    spelled = [f"{name} [{unit}]" if unit and not re.search(r"[\[(]", name) else name for name, unit in units]
+    table = "\n".join(separator.join(row[first:width]) for row in [[*spelled, *names[len(spelled) :]], *rows]) + "\n"
+    step_s = stated.get("Delta_X", ["nan"])[0].replace(",", ".")
+    return f"dt: {float(step_s):.15f} s\n{table}" if first else table
 
 
 def scale_stated(columns: Columns) -> None:

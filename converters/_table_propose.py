@@ -15,6 +15,7 @@ from ._table_headerless import in_an_array, perhaps
 from ._table_map import IN_WHOLE, NO_UNIT, Entries, Proposal, column_named
 from ._table_motion import doubt_gravity, unit_by_motion
 from ._table_names import (
+    BIAS,
     CORE_MOTION,
     ESTIMATED,
     SI_WORDS,
@@ -156,10 +157,15 @@ def _triples(sensor: str, names: dict[str, tuple[str, str]], columns: Columns) -
 
 
 def _by_units(units: dict[str, float], names: dict[str, tuple[str, str]]) -> list[dict[str, str]]:
-    """Columns x, y and z alone, whose units are a sensor's: `X (rad/s)`; none of several."""
-    leaves = {column: split_name(leaf_of(column))[0] for column, (_, unit) in names.items() if unit in units}
-    found = [(leaf, column) for column, leaf in leaves.items() if leaf in ("x", "y", "z")]
-    return [dict(found)] if sorted(leaf for leaf, _ in found) == ["x", "y", "z"] else []
+    """Columns x, y and z of one name, in a sensor's unit: `X (rad/s)`, `Vitesse X (rad/s)`; none of several."""
+    found: dict[str, dict[str, str]] = {}
+    for column in [column for column, (_, unit) in names.items() if unit in units]:
+        match = re.fullmatch(r"(?P<of>.*?)_?(?P<axis>[xyz])|(?P<first>[xyz])_(?P<rest>.*)", split_name(leaf_of(column))[0])
+        if match and not re.search(rf"{BIAS}|{ESTIMATED}", spaced_name(column)):
+            of, axis = group_of(column) + (match["of"] or match["rest"] or ""), match["axis"] or match["first"]
+            found.setdefault(of, {})[axis] = column
+    whole = [each for each in found.values() if {*each} == {*"xyz"}]
+    return whole if len(whole) == 1 else []
 
 
 def _beside(gyros: Sequence[dict[str, str]], accels: Sequence[dict[str, str]]) -> Sequence[dict[str, str]]:

@@ -7,9 +7,9 @@ from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
-from ._table_groups import TRUE_GROUPS
 from ._table_look import MAX_LARGER, look
 from ._table_map import IMU_GROUP, POSES_GROUP, TRUTH_GROUP
+from ._table_pose_names import TRUE_GROUPS
 from ._table_sensors import SENSORS, SPACED, WORD, pairs_among, plain_among, sensors_among
 
 Names = Mapping[Path, str]  # of tables, without their endings

@@ -19,7 +19,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
 from ._table_dates import NO_ZONE, calendar_times, damaged_times, join_dates
-from ._table_header import header_of, note_unused_header, refuse_other_header, units_in_comments
+from ._table_header import header_of, note_unused_header, refuse_other_header, units_in_comments, without_numbers_of_columns
 from ._table_names import leaf_of, tells_apart
 from ._table_numbers import (
     COMMA_NUMBER,
@@ -36,7 +36,7 @@ from ._table_numbers import (
 from ._table_packed import UTF16
 
 WIDEST = 64  # columns of a matrix; wider ones are images
-MAX_LINE = 65_536
+MAX_LINE, TRANSPOSE = 65_536, "Transpose it, if it holds a sample a column"
 MIN_NUMBERS = 4  # in a row: a time and a vector
 MIN_NAMED = 0.1  # share of the rows that have as many fields as the header, if it is theirs
 LOOKED_AT = 200  # first lines, which show whether text is a table, and its words between the numbers
@@ -194,8 +194,8 @@ def read_csv(text: str, columns: Columns, path: Path, minimum: int = MIN_NUMBERS
     """
     lines = [line for line in text.splitlines() if line.strip()]
     if any(len(line) > MAX_LINE for line in lines):
-        raise DataError("has a line of more than 65 536 characters", where=path, expected="a table of text")
-    delimiter = _delimiter(lines, minimum)
+        raise DataError("has a line of more than 65 536 characters", where=path, expected="a sample a row", fix=TRANSPOSE)
+    lines = without_numbers_of_columns(lines, delimiter := _delimiter(lines, minimum))
     first = next((n for n, line in enumerate(lines) if _is_row(line, delimiter, minimum)), len(lines))
     several = (
         part for line in lines[:first] if line.startswith(COMMENTS) for part in re.split(r", |: (?=.*=)| (?=\w+=\S)", line)

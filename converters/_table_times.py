@@ -11,7 +11,7 @@ from imutool.errors import ConfigError
 from imutool.recording.message_log import MessageLog
 
 from ._table_dates import NUMBERED, WEEK_NS, gps_times
-from ._table_names import TIME_WORDS, name_and_unit, split_name, unit_named
+from ._table_names import OWN_TIME, TIME_WORDS, name_and_unit, spaced_name, split_name, unit_named
 from ._table_text import Columns
 from ._table_units import TIME_NS, USUAL_TIME_NS
 from ._table_wraps import begun_anew, unwrapped
@@ -89,6 +89,25 @@ def read_clocks_and_days(columns: Columns) -> None:
                 columns.texts.pop(column, None)
                 columns.local_times.append(column)
                 columns.remarks.notes.append(f"{column!r} counts days as {program} does; it names no zone and counts as UTC")
+
+
+def fill_own_times(columns: Columns) -> None:
+    """Interpolate a sensor's own time in rows that lack its samples, as before a gyro starts."""
+    spelled = {column: spaced_name(column) for column in columns.values}
+    for column, values in [*columns.values.items()]:
+        own = next(filter(None, (re.match(form, spelled[column]) for form in OWN_TIME.values())), None)
+        own = own if own and own[0].endswith("_t") else None
+        missing = ~np.isfinite(values.astype(float)) if own else np.zeros(0, bool)
+        beside = [c for c in spelled if own and c != column and spelled[c].startswith(own[0][:-1])]
+        beside = [c for c in beside if len(columns.values[c]) == len(values)]
+        if not 0 < missing.sum() < len(values) or not beside:
+            continue
+        if not any(np.isfinite(columns.values[c][missing].astype(float)).any() for c in beside):
+            rows, filled = np.arange(len(values)), values.astype(float)
+            filled[missing] = np.interp(rows[missing], rows[~missing], filled[~missing])
+            columns.values[column], texts = filled, columns.texts.get(column, [])
+            for row in np.flatnonzero(missing).tolist() if texts else ():
+                texts[row] = str(filled[row])
 
 
 def rises(values: np.ndarray) -> bool:

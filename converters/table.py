@@ -211,7 +211,10 @@ def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
     accel = vectors_named(columns, table.accel, table.accel_scale, table.accel_offset, place) * ACCEL_SI[table.accel_unit]
     for label, t_ns, values in (("gyro", gyro_ns, gyro), ("accel", accel_ns, accel)):
         if len(t_ns) != len(values):
-            raise ConfigError(f"the {label} has {len(values)} rows and its time {len(t_ns)}", where=place, expected="as many")
+            fix = "Name its times as `accel_time`" if label == "accel" and not table.accel_time else ""
+            raise ConfigError(
+                f"the {label} has {len(values)} rows and its time {len(t_ns)}", where=place, expected="as many", fix=fix
+            )
     imu, _, notes = joined(gyro_ns, gyro, accel_ns, accel, table.topic)
     columns.remarks.notes.extend([*notes, *said_epoch(int(imu.t_ns[0]), table.time)])
     columns.remarks.losses.extend(lost_to_set_back(gyro_ns, table.topic))

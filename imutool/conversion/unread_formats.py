@@ -53,9 +53,13 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "it is a video",
         "Extract its telemetry as CSV or JSON, as gopro-telemetry or telemetry-parser do, and convert that",
     ),
-    rb"(\xef\xbb\xbf)?<\?xml.{0,200}<mvnx": (
+    rb"(\xef\xbb\xbf)?<\?xml.{0,900}<(!DOCTYPE )?mvnx": (
         "it is a motion of Xsens MVN, which holds what its model of the body estimates",
         "Export what the sensors measured from the .mvn or .mtb as text, and convert that",
+    ),
+    rb"(.{0,200}?\xfa\xff\x36[\x01-\xfe]){4}": (  # messages MTData2 one behind another
+        "it is a stream of messages (Xbus) of an Xsens sensor",
+        "Export it as text with MT Manager, and convert that",
     ),
     rb"[\x02-\x05]P": (
         "it is a C3D file of a motion capture",

@@ -408,6 +408,8 @@ def test_converting_needs_no_torch():
         (b"\x0e\x10\x9d\x05\x40\x00\x00\x00.FIT", "FIT file.*gyroscope_data"),
         (b"\x00\x00\x00\x14ftypmp41", "a video.*telemetry"),
         (b'<?xml version="1.0" encoding="UTF-8"?>\n<mvnx version="4">', "Xsens MVN.*sensors measured"),
+        (b'<?xml version="1.0"?>\n<!-- ' + 300 * b"a" + b' -->\n<mvnx version="3">', "Xsens MVN.*sensors measured"),
+        (b"\x20\x0c" + 8 * (b"\xfa\xff\x36\x44" + bytes(69)), "Xsens sensor.*MT Manager"),
         (b"\x80\x04\x95\x0f\x00\x00\x00\x00\x00\x00\x00}\x94\x8c\x03acc\x94K\x01s.", "pickle of Python.*numpy.savez"),
         (b"\x02P,\x00", "C3D file.*beside the table"),
         (

@@ -11,6 +11,7 @@ from support.tables import write_csv
 from imutool.converters import table
 from imutool.converters._table_dates import calendar_times
 from imutool.converters._table_files import kind_of, load
+from imutool.converters._table_names import name_and_unit
 from imutool.converters._table_propose import propose
 from imutool.converters._table_text import Columns
 from imutool.errors import ConfigError, DataError
@@ -78,6 +79,8 @@ def test_nanoseconds_without_their_second_are_no_time(tmp_path):
 POSES = {
     "ridi": ([*(f"pos_{a}" for a in "xyz"), *(f"ori_{a}" for a in "wxyz")], "estimate"),
     "motion capture": ([*(f"vicon_p{a}" for a in "xyz"), *(f"vicon_q{a}" for a in "wxyz")], "truth"),
+    "behind": ([*(f"p_gt_{a}" for a in "xyz"), *(f"q_gt_{a}" for a in "wxyz")], "truth"),
+    "at the end": ([*(f"p{a}_gt" for a in "xyz"), *(f"q{a}_gt" for a in "wxyz")], "truth"),
     "angles beside": ([*(f"p_{a}" for a in "xyz"), *(f"q_{a}" for a in "wxyz")], "estimate"),
 }
 
@@ -653,3 +656,49 @@ def test_a_comment_that_names_no_column_or_no_unit_of_it_states_none(tmp_path):
     path = write_csv(tmp_path / "board.csv", names, [10 * np.arange(COUNT), *ACCEL.T, *GYRO.T], above=above)
     with pytest.raises(ConfigError, match="no unit of the gyro"):
         table.read_sequence(table.sequences(path)[0])
+
+
+@pytest.mark.parametrize("gyro", ["Vitesse angulaire {} (rad/s)", "Šp‘¬“x{} (rad/s)", "{}_rotation (rad/s)"])
+def test_units_show_the_sensors_whose_names_are_in_another_language(tmp_path, gyro):
+    names = ["Temps (s)", *(gyro.format(axis) for axis in "XYZ"), *(f"Przyspieszenie {axis} (m/s²)" for axis in "XYZ")]
+    log = table.read_sequence(table.sequences(write_csv(tmp_path / "log.csv", names, [T_NS * 1e-9, *GYRO.T, *ACCEL.T]))[0])
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO)
+    np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL)
+
+
+@pytest.mark.parametrize("columns", ["One", "No"])
+def test_a_measurement_file_of_labview_is_a_table_in_its_units(tmp_path, columns):
+    step_s = float(T_NS[1] - T_NS[0]) * 1e-9
+    lines = [
+        "LabVIEW Measurement\t",
+        "Separator\tTab",
+        "Decimal_Separator\t,",
+        f"X_Columns\t{columns}",
+        "***End_of_Header***\t",
+    ]
+    lines += ["Channels\t6\t\t\t\t\t\t", "\t".join(["Y_Unit_Label", *3 * ["deg/s"], *3 * ["m/s^2"]])]
+    lines += ["\t".join(["Delta_X", *6 * [str(step_s).replace(".", ",")]]), "***End_of_Header***\t\t\t\t\t\t"]
+    lines.append("\t".join(["X_Value", *(name.split()[0] for name in IMU_NAMES), "Comment"]))
+    for t, gyro, accel in zip((np.arange(len(T_NS)) * step_s).tolist(), np.rad2deg(GYRO).tolist(), ACCEL.tolist(), strict=True):
+        fields = [repr(t) if columns == "One" else "", *map(repr, gyro), *map(repr, accel)]
+        lines.append("\t".join(fields).replace(".", ","))
+    (tmp_path / "log.lvm").write_text("\n".join(lines) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path / "log.lvm")[0])
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO)
+    np.testing.assert_allclose(log.imus["/imu0"].t_ns, np.arange(len(T_NS)) * step_s * 1e9, atol=1e3)
+
+
+UNIT_FORMS = {
+    "rad/s": ["(radians/sec)", "(rad·s⁻¹)", "_radians_per_second"],
+    "deg/s": ["(°/sec)", "(º/s)", "_degrees_per_second", "[deg*s-1]"],
+    "m/s^2": ["(m/sec^2)", "(m/s/s)", "(m·s⁻²)", "(meters per second squared)", "_meters_per_second_squared", "_m_per_sec2"],
+    "cm/s^2": ["(Gal)"],
+    "g": ["(g-force)"],
+    "us": ["[μs]", "(micros)"],  # a Greek letter
+    "": ["_degrees", "(radians)", "(m/s)"],
+}
+
+
+@pytest.mark.parametrize("unit", UNIT_FORMS)
+def test_units_in_headers_have_many_forms(unit):
+    assert {form: name_and_unit(f"value_x{form}", "")[1] for form in UNIT_FORMS[unit]} == dict.fromkeys(UNIT_FORMS[unit], unit)

@@ -110,6 +110,24 @@ def test_dates_without_marks_are_times_in_utc_also_across_midnight(tmp_path: Pat
     assert log.imus["/imu0"].t_ns.tolist() == [(start_ms + 10 * n) * 10**6 for n in range(COUNT)]
 
 
+@pytest.mark.parametrize("form", ["{s:.2f} sec", "{s:.2f} secs", "{m} min", "0 days 00:00:{s:09.6f}"])
+def test_durations_of_matlab_and_pandas_are_times(tmp_path: Path, form: str) -> None:
+    moments = [form.format(s=n / 100, m=n / 6000) for n in range(COUNT)]
+    (tmp_path / "imu.csv").write_text("\n".join(["Time,gx,gy,gz,ax,ay,az", *lines(np.array(moments), GYRO, ACCEL)]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path / "imu.csv")[0], mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_allclose(log.imus["/imu0"].t_ns, T_NS, atol=1.0)
+
+
+@pytest.mark.parametrize("first", ["0,1,2,3,4,5,6", ",0,1,2,3,4,5,6"])
+def test_numbers_of_columns_above_a_table_are_no_sample(tmp_path: Path, first: str) -> None:
+    """As pandas writes them: they were the first sample."""
+    rows = [f"{n},{row}" if first.startswith(",") else row for n, row in enumerate(lines(T_NS / 1e9, GYRO, ACCEL))]
+    (tmp_path / "imu.csv").write_text("\n".join([first, *rows]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path / "imu.csv")[0], mapping={"gyro_unit": "rad/s", "time_unit": "s"})
+    assert np.array_equal(log.imus["/imu0"].t_ns, T_NS)
+    assert np.array_equal(log.imus["/imu0"].gyro, GYRO)
+
+
 @pytest.mark.parametrize("epoch", [116_444_736 * 10**9, 621_355_968 * 10**9])
 def test_ticks_of_windows_are_dates(tmp_path: Path, epoch: int) -> None:
     t_ns = 1_714_564_800 * 10**9 + T_NS

@@ -372,6 +372,14 @@ def test_quaternions_of_no_stated_order_are_poses_where_they_turn_as_the_gyro_do
     np.testing.assert_allclose(log.imus["/imu0"].gyro, gyro)
 
 
+@pytest.mark.parametrize("name", ["quat_vicon", "q_gt", "qViconReference"])
+def test_an_array_with_a_word_for_the_truth_behind_its_name_is_the_truth(tmp_path, name):
+    scipy.io.savemat(tmp_path / "trial.mat", {"t": T_S, "gyr": GYRO, "acc": ACCEL, name: Q_WXYZ})
+    log = read(tmp_path / "trial.mat")
+    assert log.kinds == {"/ground_truth/pose": "truth"}
+    np.testing.assert_allclose(log.poses["/ground_truth/pose"].q_wb_wxyz, Q_WXYZ, atol=1e-12)
+
+
 def test_quaternions_that_turn_otherwise_stay_numbers(tmp_path):
     angles = np.stack([0.8 * np.sin(2 * np.pi * f * T_S + k) for k, f in enumerate((0.9, 0.27, 0.71))], axis=1)
     other = Rotation.from_euler("ZYX", angles).as_quat()
@@ -453,6 +461,45 @@ def test_a_table_of_several_sensors_with_a_time_each_keeps_every_row(tmp_path, s
     assert log.kinds == {"/ground_truth/pose": "truth"}
     assert np.array_equal(log.poses["/ground_truth/pose"].t_ns, stamps["vicon"])
     assert log.remarks.losses == []
+
+
+def test_an_imu_that_the_rows_of_faster_samples_repeat_has_its_own_times_once(tmp_path):
+    """As `pandas.merge_asof` joins an EMG and an IMU: all samples of the IMU were said to be those of the EMG's rows."""
+    rows_s = T_S[0] + 0.4 * (T_S[1] - T_S[0]) * np.arange(2 * COUNT)
+    of = np.searchsorted(T_S, rows_s, "right") - 1
+    names = ["t", "emg", "imu_t", *(f"imu_gyro_{a} [rad/s]" for a in "xyz"), *(f"imu_acc_{a} [m/s^2]" for a in "xyz")]
+    log = read(write_csv(tmp_path / "log.csv", names, [rows_s, rows_s**2, T_S[of], *GYRO[of].T, *ACCEL[of].T]))
+    imu = log.imus["/imu0"]
+    np.testing.assert_allclose(imu.t_ns * 1e-9, T_S[: len(imu.t_ns)])
+    np.testing.assert_allclose(imu.gyro, GYRO[: of[-1] + 1])
+    np.testing.assert_allclose(log.scalars["/t_emg"].t_ns * 1e-9, rows_s)
+
+
+@pytest.mark.parametrize("form", ["rows", "arrays"])
+@pytest.mark.parametrize("named", [("t_gyro", "t_acc"), ("timeGyro", "timeAcc"), ("gyro_time", "acc_time")])
+def test_times_named_for_their_sensors_are_theirs(tmp_path, named, form):
+    """The accelerometer had those of the gyro in rows, and arrays of other lengths were refused."""
+    accel_s = (T_S + 0.0013)[:: 1 if form == "rows" else 2]
+    if form == "rows":
+        names = [named[0], *(f"gyro_{a} [rad/s]" for a in "xyz"), named[1], *(f"acc_{a} [m/s^2]" for a in "xyz")]
+        path = write_csv(tmp_path / "log.csv", names, [T_S, *GYRO.T, accel_s, *ACCEL.T])
+    else:
+        path = tmp_path / "log.mat"
+        scipy.io.savemat(path, {named[0]: T_S, "gyro_rad_s": GYRO, named[1]: accel_s, "acc": ACCEL[::2]})
+    assert read(path).metadata["imutool/map"]["time"] == named[0]
+    assert read(path).metadata["imutool/map"]["accel_time"] == named[1]
+
+
+def test_a_gyro_that_skips_rows_keeps_its_own_times(tmp_path):
+    """As SensorLog of iOS writes it: the program's uneven times took their place."""
+    own = T_S + 0.002
+    logged = T_S + 0.1 + 0.01 * np.sin(np.arange(COUNT))
+    gyro, skipped = np.concatenate([own[:, None], GYRO], axis=1), np.arange(COUNT) % 7 < 2
+    gyro[skipped] = np.nan
+    names = ["loggingTime [s]", "accelerometerTimestamp_sinceReboot", *(f"accelerometerAcceleration{a} [m/s^2]" for a in "XYZ")]
+    names += ["gyroTimestamp_sinceReboot", *(f"gyroRotation{a}" for a in "XYZ")]
+    log = read(write_csv(tmp_path / "phone.csv", names, [logged, T_S, *ACCEL.T, *gyro.T]))
+    np.testing.assert_allclose(log.imus["/imu0"].t_ns * 1e-9, own[~skipped & (own <= T_S[-1])], atol=1e-6)
 
 
 def test_a_time_that_stands_in_some_rows_of_an_imu_loses_none_of_them(tmp_path):
