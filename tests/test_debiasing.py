@@ -29,7 +29,7 @@ from imutool.bias.neural_ode import Config
 from imutool.bias_start.bias_at_rest import at_rest, auto
 from imutool.bias_start.bias_from_truth import from_truth
 from imutool.bias_start.correction import OnlineDebiaser, apply
-from imutool.bias_start.initial_bias import InitialBias, from_numbers, prior, smoothed_start, tracked_from_prior
+from imutool.bias_start.initial_bias import InitialBias, bias_prior, from_numbers, prior, smoothed_start, tracked_from_prior
 from imutool.bias_start.model_choice import estimate_at_rest
 from imutool.cleaning import CleaningSettings
 from imutool.cli.debias import assigned
@@ -374,7 +374,7 @@ def test_smoothing_takes_the_whole_log_and_says_so(source: Path, recording: Reco
         model = load(path)
     report = debias(source, tmp_path / "out.mcap", model=path, smooth=True)
     imu = recording.imu
-    start = smoothed_start(model, [(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)])
+    start = smoothed_start(model, [(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)], bias_prior(model))
     made = read(tmp_path / "out.mcap", imu="/imu0/debiased").imu
     np.testing.assert_allclose(made.gyro, apply(model, start, imu).imu.gyro, rtol=0, atol=1e-12)
     assert report.starts["/imu0"].how == start.how

@@ -15,7 +15,7 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import BiasModel, Vector6
-from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_blocks
+from imutool.bias_start.bias_tracking import FilteredBlock, Samples, filter_blocks
 from imutool.bias_start.initial_bias import (
     AT_REST_STD,
     TRACKED_BY,
@@ -41,6 +41,7 @@ REST_BEGINS_WITHIN_S = 5.0  # a later stop would give a bias from the future
 MAX_UNKNOWN = 1e-3  # rad/s, deviation of a bias that may be left unknown: 3 degrees in a minute
 UNTRAINED = BiasPrior(np.zeros(6), np.full(6, np.inf), np.full(6, MAX_UNKNOWN))  # of the change from stop to stop
 UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sensor nobody calibrated (BMI160 of TUM-VI: 1.3)
+CLEAR = 0.01  # rad/s, of a bias by gravity in motion: a wrong unit's has 0.03, the own from 0.001 to 0.006
 REFUTED, SURE, UNUSUAL = 15.0, 3.0, 2.0  # log-likelihood and deviations that refute a stop; deviations that ask for both
 MAX_SURPRISING = 0.05  # share of such innovations; training logs 0.00, other sensors at least 0.05 where bias is no evidence
 PIECE = 512  # samples, of which the search for a stop takes no more than it needs
@@ -67,7 +68,7 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
     t_s, gyro, accel = relative_samples(imu.rows(slice(0, int(np.searchsorted(imu.t_ns, first_ns + nanoseconds(end_s))))))
     u, at_stop = np.concatenate([gyro, accel], axis=1), t_s >= begin_s
     difference = (u - model.stream(before.mean)(t_s, gyro, accel))[at_stop].mean(axis=0)
-    if np.linalg.norm(difference[:3] / before.std[:3]) > UNUSUAL and refuted_stops(relative_samples(imu)):
+    if np.linalg.norm(difference[:3] / before.std[:3]) > UNUSUAL and refuted_stops(relative_samples(imu), model):
         if not model.card:
             raise _no_rest()
         start = tracked_from_prior(model, first_ns)
@@ -82,9 +83,7 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
     last = [blocks[-1].step.after] * 2
     (rest, _), (_, P) = before.supported(last, np.full(2, end_s), np.array([True, False]))
     std = np.sqrt(np.diag(P))  # in motion, where the bias is used
-    source = f"{end_s - begin_s:.1f} s at rest from {begin_s:.1f} s on"
-    if model.card:
-        source = f"{source}, {training_source(model)}"
+    source = f"{end_s - begin_s:.1f} s at rest from {begin_s:.1f} s on" + f", {training_source(model)}" * bool(model.card)
     how = f"{source}, {accuracy(std)}, then {TRACKED_BY}"
     return InitialBias(rest, std, how, white_noise(u[at_stop]), track, before, end_s)
 
@@ -201,34 +200,36 @@ def rest_differences(
 
 def stops_in(samples: Samples) -> list[tuple[float, float]]:
     """Beginning and end (s) of each stop in samples."""
-    t_s, gyro, accel = samples
-    stops = rest_stretches(Imu(np.round(t_s * 1e9).astype(np.int64), gyro, accel))
+    t_s = samples[0]
+    stops = rest_stretches(Imu(np.round(t_s * 1e9).astype(np.int64), *samples[1:]))
     return [(float(t_s[first]), float(t_s[last - 1])) for first, last in stops]
 
 
-def refuted_stops(samples: Samples) -> tuple[Vector6, Vector6] | None:
+def refuted_stops(samples: Samples, model: BiasModel) -> tuple[Vector6, Vector6] | None:
     """Bias and its deviation by gravity in motion, where this refutes the first stop.
 
     A turn about gravity looks like rest. The innovations after it are likelier where all is taken for motion, and the bias
-    about gravity is another one. Of logs of EuRoC, FETCH, BROAD, RepoIMU and a car their log-likelihood is larger by 4 at most.
+    about gravity is another one: of a trained model, clearly that of its prior (a wrong unit's correction refutes real stops).
+    Of logs of EuRoC, FETCH, BROAD, RepoIMU and a car their log-likelihood is larger by 4 at most.
     """
-    known = replace(UNTRAINED, std=UNKNOWN_STD, settings=bias_prior(static.Model()).settings)
-    both = [BiasFilter(prior, ahead=True) for prior in (known, replace(known, stops=False))]
-    runs = zip(*([*each.feed(*samples), *each.finish()] for each in both), strict=True)
+    own = bias_prior(model)
+    known = replace(UNTRAINED, mean=own.mean, std=UNKNOWN_STD, settings=own.settings)
+    runs = zip(*(filter_blocks(model, [samples], each) for each in (known, replace(known, stops=False))), strict=True)
     later = list(itertools.dropwhile(lambda blocks: not blocks[0].resting, runs))
     moving = list(zip(*(blocks for blocks in later if not blocks[0].resting), strict=True))
     if not moving:
         return None
     stopped, moved = (innovations(block.step for block in blocks) for blocks in moving)
-    if (moved.chi_square > SURPRISING).mean() > MAX_SURPRISING:  # of a clipped gyro, which gravity contradicts in any case
-        return None
+    calm = (moved.chi_square > SURPRISING).mean() <= MAX_SURPRISING  # gravity contradicts a clipped gyro in any case
     last = moving[1][-1].step.after
     ends = samples[0].searchsorted((later[0][0].start_s, later[0][0].end_s))
     rate, force = (u[slice(*ends)].mean(axis=0) for u in samples[1:])
     up, P = force / np.linalg.norm(force), last.covariance(False)
     turn, std = up @ (rate - last.bias[:3]), np.sqrt(up @ P[:3, :3] @ up)
     refuted = moved.log_likelihood.sum() - stopped.log_likelihood.sum() > REFUTED and abs(turn) > SURE * std
-    return (last.bias, np.sqrt(np.diag(P))) if refuted else None
+    off, clear = up @ (last.bias - own.mean)[:3], SURE * np.hypot(std, np.linalg.norm(up * own.std[:3]))
+    own_unit = not model.card or (std < CLEAR and abs(off) < clear)
+    return (last.bias, np.sqrt(np.diag(P))) if calm and refuted and own_unit else None
 
 
 def changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], prior: BiasPrior) -> Iterator[str]:
@@ -274,7 +275,6 @@ def _combined(start: InitialBias, stretches: Sequence[_RestStretch], first_ns: i
     count = sum(stretch.samples for stretch in stretches)
     noise = np.sqrt(np.sum([stretch.squares for stretch in stretches], axis=0) / count)
     mean = np.sum([stretch.mean * stretch.samples for stretch in stretches], axis=0) / count
-
     gain = var[:3] / (var[:3] + AT_REST_STD[:3] ** 2 + noise[:3] ** 2 / count)
     rest[:3] += gain * (mean[:3] - start.rest[:3])
     var[:3] *= 1 - gain

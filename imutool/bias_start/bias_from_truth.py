@@ -5,6 +5,7 @@ The constant bias that explains the drift of the integrated samples.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from imutool.array_types import Bool, Float64, Int64
 from imutool.bias.model import COLUMNS, Array, BiasModel, Vector6
+from imutool.bias_start.bias_at_rest import MAX_UNKNOWN, UNUSUAL, refuted_stops, rest_differences
 from imutool.bias_start.initial_bias import (
     MIN_STD,
     TRACKED_BY,
@@ -21,9 +23,9 @@ from imutool.bias_start.initial_bias import (
     prior,
     relative_samples,
 )
-from imutool.bias_start.prior_width import supported_std
+from imutool.bias_start.prior_width import BiasPrior, supported_std
 from imutool.cleaning.rules.saturation import at_limit
-from imutool.errors import DataError
+from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
 from imutool.inertial.windows import HUBER_MEDIANS
@@ -101,8 +103,34 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
         return InitialBias(rest, std, how)
     mean, spread = _updated(start, offset, variance + WORLD_TILT_STD**2)
     before = replace(bias_prior(model), mean=mean, std=np.maximum(spread, MIN_STD), minimum=None)
+    if _turns_steadily(model, recording.imu.between(first_ns, first_ns + nanoseconds(CHECKED_S)), before):
+        before, how = replace(before, stops=False), f"{how}; its stops are steady turns"
     ends_s = seconds(piece.t_ns[-1:], int(recording.imu.t_ns[0]))[0]
     return InitialBias(rest, std, f"{how}, then {TRACKED_BY}", follows=before, hold_s=float(ends_s))
+
+
+def _turns_steadily(model: BiasModel, imu: Imu, known: BiasPrior) -> bool:
+    """Whether what looks like a stop is a turn: its rate is not the known bias, and gravity in motion refutes it."""
+    samples = relative_samples(imu)
+    (at_stops,) = rest_differences(model, [samples], known.mean[None])
+    off = np.linalg.norm(at_stops[:, :3] / np.hypot(known.std[:3], MAX_UNKNOWN), axis=1)
+    return bool((off > UNUSUAL).any()) and refuted_stops(samples, model) is not None
+
+
+def truth_seconds(init: str) -> float:
+    """Seconds of `truth:SECONDS`.
+
+    Raises:
+        ConfigError: not a positive number.
+    """
+    text = init.partition(":")[2] or str(TRUTH_S)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise ConfigError(f"{init!r}", where="init", expected="truth:SECONDS, for instance truth:5")
+    return value
 
 
 def _by_calibration(model: BiasModel, piece: Imu, thirds: Sequence[Int64[np.ndarray, " _"]]) -> Vector6:

@@ -94,14 +94,17 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         return _untrained(start, samples)
     if len(samples[0]) < 2:
         return Fitness("doubtful", ("the log is too short to be judged",))
-    found = _trained(model, start, samples, about)
-    turns = found.verdict != "fits" and refuted_stops(samples)
-    return Fitness(found.verdict, (*found.reasons, STEADY_TURN)) if turns else found
+    prior = replace(bias_prior(model), stops=start.follows is None or start.follows.stops)
+    prior = prior if model.prior_std.any() else replace(prior, std=UNKNOWN_STD)  # that of an unknown sensor
+    found = _trained(model, start, samples, about, prior)
+    if found.verdict == "fits" or not refuted_stops(samples, model):
+        return found
+    found = _trained(model, start, samples, about, replace(prior, stops=False))
+    return Fitness(found.verdict, (*found.reasons, STEADY_TURN))
 
 
-def _trained(model: BiasModel, start: InitialBias, samples: Samples, about: Mapping[str, str]) -> Fitness:
+def _trained(model: BiasModel, start: InitialBias, samples: Samples, about: Mapping[str, str], prior: BiasPrior) -> Fitness:
     """Fitness of a trained model."""
-    prior = replace(_prior(model), stops=start.follows is None or start.follows.stops)
     unknown = replace(prior, mean=np.where(np.abs(prior.mean) > UNKNOWN_STD, prior.mean, 0.0), std=UNKNOWN_STD, minimum=None)
     corrected = _without_motion(model, samples, prior)
     found, none, unstarted = _evidence((corrected, samples, corrected), (prior, unknown, unknown))
@@ -147,18 +150,12 @@ def _untrained(start: InitialBias, samples: Samples) -> Fitness:
     """Fitness of a constant bias, which needs no training, from the stops of a log."""
     units = sorted({path.stem.rpartition("-")[0] for path in library().glob("*.safetensors")})
     other_start, harmful = contradicted_start(start.rest, start.std, *shown_at_rest(samples))
-    if np.linalg.norm(start.rest[:3]) > TELLING[0] / 2.0 and (shown := refuted_stops(samples)):
+    if np.linalg.norm(start.rest[:3]) > TELLING[0] / 2.0 and (shown := refuted_stops(samples, static.Model())):
         in_motion, turned = contradicted_start(start.rest, start.std, shown[0], DEPENDENT * shown[1] + ONLY_GYRO)
         other_start, harmful = [*other_start, *in_motion, STEADY_TURN], harmful or turned
     doubts = (*other_start, *changed_at_rest(samples, stops_in(samples), UNTRAINED))
     trained = f"it needs no training; trained models ship for {', '.join(units)}"
     return Fitness("unfit" if harmful else "doubtful" if doubts else "fits", (*doubts, trained))
-
-
-def _prior(model: BiasModel) -> BiasPrior:
-    """Prior of a model's training runs; without any, that of an unknown sensor."""
-    prior = bias_prior(model)
-    return prior if model.prior_std.any() else replace(prior, std=UNKNOWN_STD)
 
 
 def head(batches: Iterable[Samples]) -> Samples:
@@ -292,8 +289,8 @@ def _same_unit(model: BiasModel, about: Mapping[str, str]) -> bool:
 
 def _agreement(found: _Evidence, prior: BiasPrior, share: Share) -> str:
     """Sentence on a log that agrees with a model, and on what it does not show."""
-    maximum = f"{_deviations(found, prior).max():.1f} standard deviations"
-    agrees = f"the bias that the log shows lies within {maximum} of the training runs"
+    maximum = _deviations(found, prior).max()
+    agrees = f"the bias that the log shows lies within {maximum:.1f} standard deviations of the training runs"
     if math.isinf(share.std):  # nothing is corrected in motion
         return agrees
     return f"{agrees}; {_shown_share(share) if share.std <= HALF else 'it does not show the share of the correction in motion'}"

@@ -199,7 +199,7 @@ def tracked_from_prior(model: BiasModel, first_ns: int | None = None) -> Initial
     return InitialBias(start.rest, std, how, follows=bias_prior(model, first_ns))
 
 
-def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = "", first_ns: int | None = None) -> InitialBias:
+def smoothed_start(model: BiasModel, batches: Iterable[Samples], before: BiasPrior, where: str = "") -> InitialBias:
     """Smoothed rest bias in time, by all stops, gravity in motion and the training runs.
 
     `batches` are seconds since the first sample, gyro and accel; they are iterated again if the log contradicts the prior.
@@ -208,7 +208,7 @@ def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = ""
         DataError: less than half a second of samples.
         NoRestError: an untrained model, and a log that never rests.
     """
-    track, rested_s, *_ = smooth_bias(model, batches, bias_prior(model, first_ns))
+    track, rested_s, *_ = smooth_bias(model, batches, before)
     if not len(track.t_s):
         raise DataError("too short to be smoothed", where=where, expected="at least half a second of samples")
     if not model.card and not rested_s:

@@ -5,7 +5,6 @@ With a survey the samples are cleaned (`imutool.cleaning`). Memory does not grow
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,15 +17,16 @@ from imutool.bias.log_binding import at_rate, bound, rows_without_drift, without
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import shared_model, shipped, shipped_for
 from imutool.bias_start import Fitness
-from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
-from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
+from imutool.bias_start.bias_at_rest import UNUSUAL, at_rest, auto, over_all_rest, refuted_stops
+from imutool.bias_start.bias_from_truth import from_truth, truth_seconds
 from imutool.bias_start.bias_tracking import Samples
 from imutool.bias_start.earlier_load import with_earlier_load
-from imutool.bias_start.fitness import CHECKED_S, judge
+from imutool.bias_start.fitness import CHECKED_S, head, judge
 from imutool.bias_start.initial_bias import (
     PRIOR,
     InitialBias,
     NoRestError,
+    bias_prior,
     from_numbers,
     model_samples,
     smoothed_start,
@@ -75,25 +75,9 @@ def find_initial_bias(init: str, model: BiasModel, recording: Recording) -> Init
     if init == "prior":
         return replace(tracked_from_prior(model, int(recording.imu.t_ns[0])), how=PRIOR, follows=None)
     if init == "truth" or init.startswith("truth:"):
-        return from_truth(model, recording, _truth_s(init))
+        return from_truth(model, recording, truth_seconds(init))
     from_samples = {"stationary": at_rest, "auto": auto}.get(init)
     return from_numbers(init) if from_samples is None else from_samples(model, recording.imu)
-
-
-def _truth_s(init: str) -> float:
-    """Seconds of `truth:SECONDS`.
-
-    Raises:
-        ConfigError: not a positive number.
-    """
-    text = init.partition(":")[2] or str(TRUTH_S)
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < math.inf:
-        raise ConfigError(f"{init!r}", where="init", expected="truth:SECONDS, for instance truth:5")
-    return value
 
 
 def choose_imus(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) -> list[str]:
@@ -202,10 +186,16 @@ def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Location) -> Initi
 
 
 def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Location, first_ns: int) -> InitialBias:
+    before = bias_prior(model, first_ns)
     try:
-        return smoothed_start(model, batches, str(where), first_ns)
+        start = smoothed_start(model, batches, before, str(where))
+        unusual = np.linalg.norm((start.rest - before.mean)[:3] / before.std[:3]) > UNUSUAL
+        if not (model.card and unusual and refuted_stops(head(batches), model)):
+            return start
+        start = smoothed_start(model, batches, replace(before, stops=False), str(where))
     except NoRestError as error:
         raise _no_start(where) from error
+    return replace(start, how=f"{start.how}; its stops are steady turns")
 
 
 def _imu_batches(

@@ -111,7 +111,8 @@ def _smoothing(pool: Pool, log: int) -> tuple[float, float]:
     first = first[:: -(-len(first) // MAX_WINDOWS) or 1]
     windows, eye = pool.windows(first, n, pool.t.new_zeros(len(first), 6)), torch.eye(3).to(pool.t)
     R = windows.R_start.mT @ windows.R_end
-    e, turn = rotation_residual(windows.segment.gyro, windows.dt, R)[0], so3.log(R)
+    e = rotation_residual(windows.segment.gyro, windows.dt, R)[0]
+    turn = so3.log(R @ so3.exp(-e))  # the gyro's: noise of the poses is in the residual, and would look like a scale
     steps, ends = torch.arange(-h, h + 1).to(pool.t), [pool.gyro[pool.around(end, h, h)] for end in (first, first + n)]
     slopes = [torch.einsum("k,mki->mi", steps * pool.rate_hz / (steps @ steps), rates) for rates in ends]
     changes = [at[1] - (R.mT @ at[0][..., None])[..., 0] for at in ([rates.mean(1) for rates in ends], slopes)]

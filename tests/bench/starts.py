@@ -76,7 +76,7 @@ def score(model: BiasModel, recording: Recording, own: Vector6) -> tuple[list[fl
     auto = bias_at_rest.auto(model, imu)
     auto.stream(model)(*samples(imu))
     halfway = time.perf_counter()
-    smooth = initial_bias.smoothed_start(model, [samples(imu)])
+    smooth = initial_bias.smoothed_start(model, [samples(imu)], initial_bias.bias_prior(model))
     ended = time.perf_counter()
     starts = {
         "truth": bias_from_truth.from_truth(model, recording),

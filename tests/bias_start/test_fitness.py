@@ -15,12 +15,14 @@ from imutool.bias.model import BiasModel
 from imutool.bias.model_file import save
 from imutool.bias_start import Fitness, fitness
 from imutool.bias_start.bias_at_rest import at_rest, auto
+from imutool.bias_start.correction import apply
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import from_numbers, relative_samples
+from imutool.bias_start.model_choice import find_initial_bias, smooth_in_memory
 from imutool.errors import ModelError
 from imutool.inertial.innovations import Share
 from imutool.inertial.stationary import white_noise
-from imutool.recording import GRAVITY_M_S2, Imu, Recording
+from imutool.recording import GRAVITY_M_S2, Imu, Recording, seconds
 from imutool.sensor.made_up_flight import flight
 
 WRONG = np.array([[0.04, -0.02, 0.01], [0.02, -0.05, 0.03], [-0.03, 0.02, 0.04]])
@@ -222,21 +224,29 @@ def test_more_noise_is_doubtful_and_less_is_not(model: BiasModel, recording: Rec
     assert "5 times as noisy" in found.reasons[0]
 
 
-@pytest.mark.parametrize("untrained", [False, True])
-def test_a_steady_turn_about_gravity_is_no_stop(untrained: bool, model: BiasModel) -> None:
+@pytest.mark.parametrize(("start", "turn_rad_s"), [("static", 0.08), ("auto", 0.04), ("smooth", 0.04), ("truth", 0.04)])
+def test_a_steady_turn_about_gravity_is_no_stop(start: str, turn_rad_s: float, model: BiasModel) -> None:
     """Before the flight the sensor turns at a constant rate, as on a table: it looks like a bias until the sensor tilts."""
-    imu = flight(3, duration_s=60.0, still_s=8.0).imu
-    turns = np.arange(len(imu)) * imu.period_s < 8.5
+    log = flight(3, duration_s=60.0, still_s=8.0, room_m=0.5)
+    imu, poses, turning_s = log.imu, log.truth, 8.5
+    turns = np.arange(len(imu)) * imu.period_s < turning_s
     up = imu.accel[turns].mean(axis=0)
-    imu = replace(imu, gyro=imu.gyro + np.outer(turns, 0.08 * up / np.linalg.norm(up)))
+    imu = replace(imu, gyro=imu.gyro + np.outer(turns, turn_rad_s * up / np.linalg.norm(up)))
+    yaw = turn_rad_s * (np.minimum(seconds(poses.t_ns, int(poses.t_ns[0])), turning_s) - turning_s)
+    turned = Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0]) * Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True)
+    poses = replace(poses, q_wb_wxyz=turned.as_quat(scalar_first=True))
     own = linear.Model(linear.Config(), model.rate_hz, dict(model.tensors) | {"prior_std": 7.0 * model.prior_std})
-    own.card = model.card
+    own.card, untrained = model.card, start == "static"
     chosen = static.Model() if untrained else own
-    start = at_rest(chosen, imu) if untrained else auto(chosen, imu)
-    found = judge(chosen, start, [relative_samples(imu)], {})
+    starts = {"static": lambda: at_rest(chosen, imu), "smooth": lambda: smooth_in_memory(own, imu, "")}
+    log = replace(log, imu=imu, truths={"/ground_truth/pose": poses})
+    begun = starts[start]() if start in starts else find_initial_bias(start, own, log)
+    found = judge(chosen, begun, [relative_samples(imu)], {})
     assert found.verdict == ("doubtful" if untrained else "fits"), found
-    assert ("steady turn" in " ".join(found.reasons)) == untrained
-    assert np.linalg.norm(start.rest[:3] - model.prior_mean[:3]) == pytest.approx(0.08 * untrained, abs=5e-3)
+    assert ("steady turn" in " ".join(found.reasons)) == (start in {"static", "smooth"})
+    at_end = imu.gyro[-1] - apply(chosen, begun, imu).imu.gyro[-1]
+    for bias in (begun.rest[:3], at_end):
+        assert np.linalg.norm(bias - model.prior_mean[:3]) == pytest.approx(turn_rad_s * untrained, abs=5e-3)
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.4])

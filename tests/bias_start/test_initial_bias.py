@@ -485,7 +485,7 @@ def test_an_untrained_model_has_no_prior_to_follow_from() -> None:
 def test_the_whole_log_is_surer_than_its_start_and_later_stops_count() -> None:
     imu, _ = resting([(12.0, 18.0)])
     made = trained(prior_std=0.02)
-    start = smoothed_start(made, [samples(imu)])
+    start = smoothed_start(made, [samples(imu)], bias_prior(made))
     assert start.track is not None
     assert start.how.startswith(("5.", "6."))
     assert "s at rest in all, gravity in motion, prior of 6 runs, ±0.000" in start.how
@@ -496,11 +496,11 @@ def test_the_whole_log_is_surer_than_its_start_and_later_stops_count() -> None:
 def test_smoothing_needs_something_to_go_by() -> None:
     imu, _ = resting([])
     with pytest.raises(NoRestError, match="here: the log never rests"):
-        smoothed_start(static.Model(), [samples(imu)], "here")
-    wide = smoothed_start(trained(prior_std=0.05), [samples(imu)])
+        smoothed_start(static.Model(), [samples(imu)], bias_prior(static.Model()), "here")
+    wide = smoothed_start(made := trained(prior_std=0.05), [samples(imu)], bias_prior(made))
     assert wide.std[:3].max() > 1e-4
     with pytest.raises(DataError, match="too short to be smoothed"):
-        smoothed_start(trained(), [samples(imu.rows(slice(0, 20)))])
+        smoothed_start(made := trained(), [samples(imu.rows(slice(0, 20)))], bias_prior(made))
 
 
 def test_the_bias_of_every_stop_is_compared_with_the_bias_in_motion() -> None:
@@ -545,7 +545,7 @@ def test_a_long_rest_outweighs_the_prior_of_another_switching_on(start: str) -> 
     imu, _ = resting([(0.0, 6.0), (20.0, 26.0)])
     made = trained(mean=0.03, prior_std=5e-4)
     if start == "smooth":
-        found = smoothed_start(made, [samples(imu)])
+        found = smoothed_start(made, [samples(imu)], bias_prior(made))
     else:
         found = auto(made, imu) if start == "auto" else at_rest(made, imu)
     np.testing.assert_allclose(found.rest[:3], GYRO_BIAS, atol=3e-4)
