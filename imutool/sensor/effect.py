@@ -54,7 +54,7 @@ class Parameter:
         matters only together with an amplitude (a time constant, a frequency) has its plausible size there.
     step: the largest step whose difference is still a derivative, of the logarithm if `positive`.
     begins: it is the time (s from the log's start) at which the effect sets in, never if infinite; a fit tries all times.
-    least: the smallest value that is an answer; a fit below it is none.
+    least, most: the smallest value and the largest size that are an answer; without `maximum`, a few times the plausible size.
     fixed_in_training: the value that training gives a parameter in which the effect is not linear.
     """
 
@@ -66,6 +66,7 @@ class Parameter:
     step: float | None = None
     begins: bool = False
     minimum: float | None = None
+    maximum: float | None = None
     fixed_in_training: float | None = None
 
 
@@ -194,10 +195,7 @@ def attitude_of(motion: IdealMotion, effect: str) -> Float64[np.ndarray, "n 3 3"
 
 
 class Remembered:
-    """Function of a clock and one number that keeps its last value.
-
-    Derivatives ask for the same again and again.
-    """
+    """Function of a clock and one number that keeps its last value, for derivatives."""
 
     def __init__(self, function: Callable[[Times, float], Float64[np.ndarray, "n ..."]]) -> None:
         self._function = function

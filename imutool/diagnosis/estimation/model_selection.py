@@ -110,7 +110,7 @@ def _grown(first: _Search, base: Fit, unnamed: Sequence[Effect], later: Sequence
             if better.chosen[-1][0].name in LAGS:
                 better = with_filter_of_each_sensor(search.logs, better, search.named)
             better = with_form_of_resonance(search.logs, better, search.named)
-            before, base = base.objective, search.pruned(search.exchanged(better))
+            before, base = base.objective, search.pruned(search.exchanged(search.with_always(better)))
         elif waiting:
             search = replace(search, unnamed=(*search.unnamed, *waiting.pop(0)))
         else:
@@ -199,6 +199,17 @@ class _Search(Trial):
                     return trial
         return base
 
+    def with_always(self, base: Fit) -> Fit:
+        """The fit with the effects of `always` first.
+
+        Forms of a filter move a clock offset, or do without it.
+        """
+        first = {effect.key: (effect, theta) for effect, theta in self.always}
+        if base.keys[: len(first)] == tuple(first):
+            return base
+        own = {effect.key: (effect, theta) for effect, theta in base.chosen}
+        return fit(self.logs, tuple((first | own).values()), near=base)
+
     def simplified(self, base: Fit) -> Fit:
         """Fit with the simpler of two effects that the logs hardly tell apart."""
         for effect in [effect for effect, _ in base.chosen if effect.kind != "catalogue"]:
@@ -210,7 +221,7 @@ class _Search(Trial):
         base = with_steady_clock(self.logs, base, self.named, self.candidates.starts)
         base = with_plainer_effects(self.logs, base, self.named)
         base = without_unseen_low_pass(self.logs, base, self.named, self.settings)
-        log_p, maximum = self.candidates.log_p, self.threshold
+        base, log_p, maximum = self.with_always(base), self.candidates.log_p, self.threshold
         return with_common_arm(self.logs, base, self.named, self.settings, lambda effect, gain: log_p(effect, gain) < maximum)
 
     def pruned(self, base: Fit) -> Fit:

@@ -108,10 +108,12 @@ def with_free(effect: Effect, free: Sequence[int], sensors: tuple[str, ...] = ()
 
 
 def without_implausible(effect: Effect, theta: Theta, factor: float) -> Effect:
-    """Effect without parameters `factor` times larger than plausible, which fit noise."""
-    if not effect.linear or effect.kind != "catalogue":
+    """Effect without implausible parameters (`factor` times, or `maximum`), which fit noise."""
+    if effect.kind != "catalogue" or not (effect.linear or effect.variant == STEP):
         return effect
-    return with_free(effect, [k for k, n in enumerate(effect.parameters) if abs(theta[k]) <= factor * n.plausible])
+    maximum = [factor * n.plausible if n.maximum is None else n.maximum for n in effect.parameters]
+    free = [k for k, n in enumerate(effect.parameters) if n.begins or abs(theta[k]) <= maximum[k]]
+    return with_free(effect, free if any(not effect.parameters[k].begins for k in free) else [])
 
 
 def with_steady_clock(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect], starts: Starts) -> Fit:
@@ -130,18 +132,23 @@ def with_steady_clock(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Ef
 
 def with_plainer_effects(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with the plainer of two effects where the other is not clearly better (BIC)."""
-    poses = any(log.pair.band_hz is not None for log in logs)
-    for complex_one, theta in base.chosen:
-        sizes = _plainer(complex_one, theta, poses=poses)
-        rest = tuple(entry for entry in base.chosen if entry[0] is not complex_one)
-        plainer = [effect for effect in named if effect.name in sizes and effect.key not in base.keys]
-        parts = [(with_free(e, sizes[e.name][0], complex_one.sensors), np.array(sizes[e.name][1])) for e in plainer]
-        margin = base.logs[0].pair.settings.search.clearly_better * max(1.0, base.reduced_chi_square)
-        limits = [bic(base) + margin - parameter_cost(base, (*rest, part)) for part in parts]
-        trials = [fit(logs, (*rest, part), near=base, give_up_above=at) for part, at in zip(parts, limits, strict=True)]
-        best = min(trials, key=bic, default=base)
-        base = best if bic(best) < bic(base) + margin else base
+    for effect, _ in base.chosen:  # each is the same as long as it stays
+        base = with_plainer(logs, base, effect, named, base.logs[0].pair.settings.search.clearly_better)
     return base
+
+
+def with_plainer(logs: Sequence[WhitenedLog], base: Fit, complex_one: Effect, named: Sequence[Effect], margin: float) -> Fit:
+    """Fit with a plainer effect for one that is not better by a margin (BIC)."""
+    poses = any(log.pair.band_hz is not None for log in logs)
+    sizes = _plainer(complex_one, next(theta for effect, theta in base.chosen if effect is complex_one), poses=poses)
+    rest = tuple(entry for entry in base.chosen if entry[0] is not complex_one)
+    plainer = [effect for effect in named if effect.name in sizes and effect.key not in base.keys]
+    parts = [(with_free(e, sizes[e.name][0], complex_one.sensors), np.array(sizes[e.name][1])) for e in plainer]
+    maximum = bic(base) + margin * max(1.0, base.reduced_chi_square)
+    limits = [maximum - parameter_cost(base, (*rest, part)) for part in parts]
+    trials = [fit(logs, (*rest, part), near=base, give_up_above=at) for part, at in zip(parts, limits, strict=True)]
+    best = min(trials, key=bic, default=base)
+    return best if bic(best) < maximum else base
 
 
 def _plainer(effect: Effect, theta: Theta, *, poses: bool) -> Mapping[str, tuple[Sequence[int], Sequence[float]]]:
@@ -203,7 +210,7 @@ def unidentified(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> It
     """Unidentified `effect.parameter`: as unsure as it is large, or fixed; none of a curve."""
     name = effect.name if effect.kind == "catalogue" else effect.key
     for parameter, value, s in zip(effect.parameters, theta, std, strict=True):
-        if s > (value if parameter.positive else parameter.plausible) and not curve:
+        if s > max(abs(value), 0.0 if parameter.positive else parameter.plausible) and not curve:
             yield f"{name}.{parameter.name}"
     if isinstance(effect.forward, FixedParameters) and effect.sensors == effect.forward.effect.sensors:
         free = {parameter.name for parameter in effect.parameters}

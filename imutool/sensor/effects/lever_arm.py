@@ -13,6 +13,8 @@ from imutool.sensor.samples import IdealMotion
 from imutool.sensor.signals import ALPHA, GYRO, Signals
 from imutool.units import Three
 
+MAX_M = 30.0  # no tolerance of a sensor: on a truck, a ship or an aircraft it sits metres from the tracked point
+
 
 def _forward(motion: IdealMotion, r_b: Theta) -> IdealMotion:
     added = lever_acceleration(motion.gyro.T, motion.alpha.T, (r_b, r_b, r_b))
@@ -38,7 +40,7 @@ EFFECT = Effect(
     Stage.MOTION,
     ("accel",),
     "accel += alpha x r + omega x (omega x r)",
-    each_axis("m", 0.3),
+    tuple(replace(arm, maximum=MAX_M) for arm in each_axis("m", 0.3)),
     "it turns; the part along a single turning axis is not seen",
     _forward,
     trained=True,

@@ -22,6 +22,7 @@ from imutool.diagnosis.estimation.trial.model_error import (
     below_reference_error,
     is_over_at_once,
     is_part_of_misfit,
+    is_swing_of_motion,
     with_low_pass_error,
 )
 from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection
@@ -233,3 +234,16 @@ def test_what_is_larger_than_a_low_pass_says_nothing_of_its_error() -> None:
     selection, error = Selection((), now, now, 1), LowPassError(size=100.0, squares=0.1, cutoff_hz=CUTOFF_HZ)
     assert with_low_pass_error(selection, error, {"accel_scale": 101.0}) is selection
     assert with_low_pass_error(selection, error, {"accel_scale": 101.0, "lever_arm": 99.0}).within_error == ("lever_arm",)
+
+
+@pytest.mark.parametrize("A", [(0.0, 0.0, 0.0), (0.02, -0.01, 0.015)])
+def test_a_step_has_to_show_beside_what_follows_the_motion_around_it(A: tuple[float, ...]) -> None:
+    """Axes whose crosstalk grows with the temperature had three steps of the bias in the first four seconds."""
+    felt = planted.rich(3)
+    crosstalk = np.exp(-felt.t_s / 8.0)[:, None] * felt.gyro[:, [1, 2, 0]] * 0.3
+    stepped = np.outer(felt.t_s > 4.0, A)
+    log = planted.weighed(planted.pair(felt, added=np.hstack([crosstalk + stepped, 0.0 * crosstalk])))
+    (step,) = catalogue.diagnosed(["gyro_bias_step"])
+    for size in ((0.02, -0.01, 0.015), (-0.03, 0.0, 0.03)):
+        found = fit([log], ((step, np.array([*size, 3.995])),), iterations=0)
+        assert is_swing_of_motion(step, found) == (not any(A))

@@ -17,13 +17,14 @@ from imutool.diagnosis.estimation.observability import (
     unobservable,
     with_plainer_effects,
     with_steady_clock,
+    without_implausible,
 )
 from imutool.diagnosis.estimation.significance import bic, parameter_cost
 from imutool.diagnosis.estimation.trial.effect_forms import in_forms
 from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor import catalogue
-from imutool.sensor.effects import clock_wander
+from imutool.sensor.effects import clock_wander, gyro_scale
 
 SETTINGS = SearchSettings()
 STEPS_HZ = 5.9  # a harmonic of a walk
@@ -197,9 +198,32 @@ def test_a_drift_that_follows_the_logs_temperature_has_that_name() -> None:
         assert with_plainer_effects(logs, found, (drift, temperature)).keys == (named,)
 
 
-@pytest.mark.parametrize(("std", "vague"), [(2.0, ()), (25.0, ("low_pass.f_c",))])
-def test_a_positive_number_is_unidentified_if_it_is_as_unsure_as_it_is_large(std: float, vague: tuple[str, ...]) -> None:
-    """A cut-off of 20 Hz, certain to 2 Hz, was told as one that the logs cannot show."""
-    (effect,) = catalogue.effects(["low_pass"])
-    first = in_forms([effect], exact=False)[0]
-    assert tuple(unidentified(first, np.array([20.0]), np.array([std]), curve=False)) == vague
+@pytest.mark.parametrize(
+    ("name", "theta", "std", "vague"),
+    [
+        ("low_pass", (20.0,), (2.0,), ()),
+        ("low_pass", (20.0,), (25.0,), ("low_pass.f_c",)),
+        ("lever_arm", (6.0, -0.4, 0.1), (0.5, 0.5, 0.2), ("lever_arm.y",)),  # z is as sure as an arm is plausible
+    ],
+)
+def test_a_number_is_unidentified_if_it_is_as_unsure_as_it_is_large(
+    name: str, theta: tuple[float, ...], std: tuple[float, ...], vague: tuple[str, ...]
+) -> None:
+    """A cut-off of 20 Hz, certain to 2 Hz, was told as one that the logs cannot show, and so was an arm of 6 m."""
+    first = in_forms(catalogue.effects([name]), exact=False)[0]
+    assert tuple(unidentified(first, np.array(theta), np.array(std), curve=False)) == vague
+
+
+@pytest.mark.parametrize(
+    ("name", "theta", "left"),
+    [
+        ("lever_arm", (3.2, -0.6, 40.0), ["x", "y"]),  # it may sit metres from the tracked point
+        ("gyro_scale", (-1.0, 0.01, 0.02), ["y", "z"]),  # the motion is noise of the poses, and a scale of -1 takes it away
+        ("gyro_scale:step", (-1.0, -0.97, 0.02, 2.2), ["z", "t_step"]),
+        ("gyro_scale:step", (-1.0, -0.97, 3.0, 2.2), []),
+    ],
+)
+def test_sizes_that_no_sensor_has_leave(name: str, theta: tuple[float, ...], left: list[str]) -> None:
+    (effect,) = (one for one in gyro_scale.in_both_forms(catalogue.diagnosed()) if one.key == name)
+    reduced = without_implausible(effect, np.array(theta), SETTINGS.implausible_factor)
+    assert [parameter.name for parameter in reduced.parameters] == left

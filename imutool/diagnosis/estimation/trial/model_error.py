@@ -8,15 +8,17 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import f as fisher
 
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit
-from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.noise_estimate import leaves_slow_motion
 from imutool.diagnosis.estimation.observability import LOW_PASSES, STEADY, WANDER
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.effects.gyro_bias_step import INDEPENDENT, followed
 
 CLOCKS = (*STEADY, WANDER)
 FILTERS = (*LOW_PASSES, "mount_resonance", "gyro_delay", "gyro_hysteresis", "accel_hysteresis")
@@ -26,6 +28,7 @@ OF_MOTION = FOLLOWING | {
     *(f"{sensor}_{kind}" for sensor in ("gyro", "accel") for kind in ("scale", "misalignment", "scale_asymmetry", "quadratic")),
     *("lever_arm", "size_effect", "mount_rotation", "gyro_g_sensitivity", "gyro_scale_drift", "gyro_scale_temperature"),
 }
+BIAS_STEPS, AROUND_S = ("gyro_bias_step", "accel_bias_step"), 3.0  # on both sides, where a gain hardly changes
 
 SLOW = 0.25  # of a cut-off frequency: below, a low-pass takes 0.2 % (second order) to 3 % (first)
 SEEN_ERROR = 2.0  # times what other effects show of a low-pass's error (made-up flights whose vibrations fold: 1.4 to 3.6)
@@ -95,6 +98,41 @@ def is_part_of_misfit(effect: Effect, gain: float, found: Fit) -> bool:
     """
     minimum = found.logs[0].pair.settings.search.larger_misfit * gain
     return _follows_body(effect, found) and all(leaves_slow_motion(found, sensor, minimum) for sensor in effect.sensors)
+
+
+def is_swing_of_motion(effect: Effect, found: Fit) -> bool:
+    """Whether a step of a bias is no more than what follows the motion around it.
+
+    It is asked beside a misfit that has no name. On three seconds to each side the step has to explain more than chance (F)
+    beside a constant, everything that a misfit follows (`followed`), and both times the time, as gains that change (Chow,
+    Econometrica 28, 1960).
+    """
+    settings = found.logs[0].pair.settings.search
+    pairs = [log.pair for log in found.logs if isinstance(log.pair, Pair) and log.pair.exact]
+    if effect.name not in BIAS_STEPS or found.reduced_chi_square < settings.white_chi_square or len(pairs) < len(found.logs):
+        return False
+    others = tuple(entry for entry in found.chosen if entry[0] is not effect)
+    return all(_local_p_value(pair, effect, others, found.chosen) > settings.false_discovery_rate for pair in pairs)
+
+
+def _local_p_value(pair: Pair, effect: Effect, others: Chosen, chosen: Chosen) -> float:
+    """p-value of a step within seconds of it; one where a log does not show both sides."""
+    part, without = pair.signals[effect.sensors[0]], expected(pair, others)
+    added = np.abs(expected(pair, chosen) - without)[:, part].sum(axis=1)
+    at = int(np.argmax(np.abs(np.diff(added))))
+    near = (pair.stamp_s - pair.stamp_s[at]) / AROUND_S
+    rows = (np.abs(near) < 1.0) & pair.usable[:, part].all(axis=1)
+    follow = np.column_stack([np.ones(rows.sum()), followed(pair.ideal.sample(pair.stamp_s[rows], pair.stamp_s[rows]))])
+    beside = np.column_stack([follow, near[rows, None] * follow])
+    free = len(beside) - beside.shape[1] - 1
+    if free < beside.shape[1] or not 0 < int((near[rows] > 0).sum()) < len(beside):
+        return 1.0
+    left, singular, _ = np.linalg.svd(beside / np.maximum(np.linalg.norm(beside, axis=0), 1e-300), full_matrices=False)
+    basis = left[:, singular > INDEPENDENT * singular[0]]
+    rest, step = (pair.real - without)[rows, part], (np.arange(len(near)) > at)[rows, None].astype(np.float64)
+    rest, step = (x - basis @ (basis.T @ x) for x in (rest, step))
+    gain = (step * rest).sum(axis=0) ** 2 / (step**2).sum()
+    return float(fisher.sf(np.mean(gain / (((rest**2).sum(axis=0) - gain) / free)), rest.shape[1], free))
 
 
 def _follows_body(effect: Effect, found: Fit) -> bool:
