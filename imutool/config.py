@@ -109,19 +109,28 @@ def build(cls: type[S], values: dict[str, Any], where: str | Path | None = None)
     try:
         return msgspec.convert(values, cls)
     except msgspec.ValidationError as error:
-        raise _of_value(str(error), where) from error
+        raise _of_value(str(error), where, values) from error
 
 
-def _of_value(reason: str, where: str | Path | None) -> ConfigError:
-    """Error of msgspec in our words: the setting, what it is, and what was expected."""
+def _of_value(reason: str, where: str | Path | None, values: Any) -> ConfigError:
+    """Error of msgspec in our words: the setting, what it is in these values, and what was expected."""
     what, _, place = reason.rstrip(".").removesuffix(" - at `$`").partition(" - at `$.")
     place = place.rstrip("`")
     expected, got = "", ""
     if what.startswith("Expected "):
         expected, _, got = what.removeprefix("Expected ").partition(", got ")
-        what = f"has {got} items" if got.isdigit() else f"is {got}" if got else "is out of range"
+        what = f"has {got} items" if got.isdigit() else f"is {got}" if got else f"is {_at(place, values)}out of range"
     what, expected = (re.sub(r"`([\w |]+)`", _in_words, text) for text in (what, expected))
     return ConfigError(what, where=f"{where or 'settings'}{': ' * bool(place)}{place}", expected=expected)
+
+
+def _at(place: str, values: Any) -> str:
+    """Value at a place of msgspec, with a comma; nothing where the place hides a key."""
+    if "[...]" in place:
+        return ""
+    for key, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", place):
+        values = values[int(index) if index else key]
+    return f"{values}, "
 
 
 def _in_words(types: re.Match[str]) -> str:

@@ -177,7 +177,7 @@ def debias(
         LogError: nothing can be saved, no such IMU, one debiased already, damaged and its own target, or not to be trusted.
         ModelError: no model and no time at rest; a model for another rate, or one that does not fit; a damaged model file.
     """
-    model_choice.check_smooth(init, smooth)
+    model_choice.check_start(init, smooth)
     check_mode(check)
     if encoding not in ENCODINGS:
         raise ConfigError(f"{encoding!r}", where="encoding", expected=" or ".join(ENCODINGS))

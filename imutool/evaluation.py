@@ -21,7 +21,7 @@ from imutool.bias_start.bias_covariance import ExpectedDrift
 from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std, corrected
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
-from imutool.bias_start.model_choice import bound_to, check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
+from imutool.bias_start.model_choice import bound_to, check_start, estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
@@ -262,7 +262,7 @@ def started(
     With `force` models of other rates count, too. With `refused` a model that does not apply to the recording is left out,
     and `refused` is called with it and the error.
     """
-    check_smooth(init, smooth)
+    check_start(init, smooth)
     for given, loaded in [(given, _load(given, recording)) for given in models]:  # a model that is none ends it at once
         try:
             model, start = _model_and_start(loaded, recording, init, where, smooth, force)

@@ -78,7 +78,7 @@ def to_location(text: str) -> Location:
     if not colon:
         return Path(text)
     if scheme == "file":
-        return Path(rest)
+        return Path(unquote(re.sub("^localhost(?=/)", "", rest)))  # as `Path.as_uri` quotes (RFC 8089)
     if scheme not in STORES:
         raise ConfigError("unknown kind of store", where=redact(text), expected=", ".join(f"{name}://" for name in STORES))
     _refuse_secrets(scheme, text)

@@ -281,7 +281,7 @@ ZEROS = np.zeros((2, len(STILL.imu), 3))
         ),
         (
             lambda: imutool.train("a.mcap", "m.safetensors", settings={"steps": -1}),
-            "settings: steps: is out of range; expected an integer >=",
+            "settings: steps: is -1, out of range; expected an integer >=",
         ),
     ],
     ids=range(27),

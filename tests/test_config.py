@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,7 @@ from imutool.noise.datasheet import read as read_noise
 from imutool.sensor.made_up_flight import FlightSettings
 from imutool.sensor.physics_file import read as read_physics
 from imutool.training.fit import TrainSettings
+from imutool.training.settings import settings_of
 
 
 class Inner(Settings, frozen=True):
@@ -75,11 +77,11 @@ def test_a_word_is_read_as_toml_or_taken_as_it_is(word: str, field: str, value: 
         ("stesp=3", r"stesp is not a setting; expected one of .*steps.* Did you mean steps\?$"),
         ("inner.windw_s=3", r"inner.windw_s is not a setting; expected one of name, window_s. Did you mean inner.window_s\?$"),
         ("zzz=3", r"zzz is not a setting; expected one of anything, inner, lengths, on, rate, steps\.$"),
-        ("steps=0", r"steps: is out of range; expected an integer >= 1"),
+        ("steps=0", r"steps: is 0, out of range; expected an integer >= 1"),
         ("steps=2.5", r"steps: is a number; expected an integer"),
         ("steps=many", r"steps: is text; expected an integer"),
         ("on=1", r"on: is an integer; expected true or false"),
-        ("inner.window_s=-1", r"inner.window_s: is out of range; expected a number > 0"),
+        ("inner.window_s=-1", r"inner.window_s: is -1, out of range; expected a number > 0"),
         ("inner=3", r"inner"),
         ("steps", r"set: 'steps' sets nothing; expected key=value"),
         ("=3", r"set: '=3' sets nothing; expected key=value"),
@@ -96,6 +98,19 @@ def test_a_table_over_a_value_is_refused(file: Path) -> None:
         load(Outer, file, ["steps.more=3"])
     with pytest.raises(ConfigError, match=r"'steps' is a value, not a table"):
         load(Outer, None, ["steps=3", "steps.more=3"])
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("gyro_window_s=[]", "gyro_window_s: is [], out of range"),
+        ("gyro_window_s=[1, -2]", "gyro_window_s[1]: is -2, out of range"),
+        (f"seed={10**20}", f"seed: is {10**20}, out of range"),
+    ],
+)
+def test_settings_without_a_meaning_are_refused_before_a_training(word: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        load(settings_of("linear"), None, [word])
 
 
 def test_a_word_sets_one_value_only() -> None:

@@ -351,6 +351,12 @@ def test_smoothing_is_said_and_finds_its_own_start(log: Path, model: Path) -> No
         evaluate(log, models=[model], init="truth", smooth=True)
 
 
+@pytest.mark.parametrize("init", ["trut", "truth:0", "1,2"])
+def test_an_unknown_start_is_refused_without_a_model_too(log: Path, init: str) -> None:
+    with pytest.raises(ConfigError, match=f"init: '{init}'"):
+        evaluate(log, init=init)
+
+
 def test_masked_rows_count_nowhere(recording: Recording, log: Path, tmp_path: Path) -> None:
     """A hole in the truth: fewer samples are scored; the trajectory itself is that of the whole log."""
     t_s = (recording.truth.t_ns - recording.truth.t_ns[0]) * 1e-9

@@ -45,6 +45,12 @@ def test_a_name_without_a_store_is_a_file(text: str) -> None:
     assert to_location(f"file://{text}") == Path(text)
 
 
+@pytest.mark.parametrize("text", ["/data/a b.mcap", "/data/50 %/ä#1.mcap"])
+def test_a_file_of_a_url_is_the_one_that_it_quotes(text: str) -> None:
+    assert to_location(Path(text).as_uri()) == Path(text)
+    assert to_location(Path(text).as_uri().replace("///", "//localhost/")) == Path(text)
+
+
 def test_a_stream_is_no_location() -> None:
     with pytest.raises(ConfigError, match=r"-: is a stream.*\./-"):
         to_location("-")

@@ -21,7 +21,7 @@ from imutool.bias_start.correction import apply_with_std
 from imutool.bias_start.earlier_load import switched_on_before
 from imutool.bias_start.fitness import CHECKED_S, judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
-from imutool.bias_start.model_choice import bound_to, check_smooth, find_initial_bias, smooth_in_memory
+from imutool.bias_start.model_choice import bound_to, check_start, find_initial_bias, smooth_in_memory
 from imutool.bias_start.stretches import measured_imu, unusual_gravity
 from imutool.debiasing import DEBIASED_BY, DebiasReport
 from imutool.errors import ConfigError, DataError
@@ -270,7 +270,7 @@ def _model_and_start(
         given = static.Model.method if isinstance(model, BiasModel) else model
         ((name, chosen, start),) = evaluation.started(recording, [given], init, recording.name, smooth=smooth, force=force)
         return name, chosen, start
-    check_smooth(init, smooth)
+    check_start(init, smooth)
     model = bound_to(model, recording, force=force)
     start = smooth_in_memory(model, recording.imu, recording.name) if smooth else find_initial_bias(init, model, recording)
     return str(model.card.get("name", model.method)), model, start

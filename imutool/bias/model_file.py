@@ -19,6 +19,7 @@ from imutool import registry
 from imutool.bias.model import BiasModel, check_card
 from imutool.config import build, plain
 from imutool.errors import ImutoolError, ModelError, did_you_mean
+from imutool.file_location import local
 from imutool.mcap_io.storage.target import Target
 
 FORMAT = "imutool.model/1"
@@ -193,10 +194,11 @@ def model_file(name: str | Path) -> Path:
 
     Raises:
         ModelError: neither.
+        ConfigError: a URL of an object store.
     """
     if not isinstance(name, str | Path):
         raise ModelError(f"a model of type {type(name).__name__}", expected="a file, or the name of a model")
-    path = Path(name)
+    path = local(name, "model")
     return path if path.suffix.lower() in (".toml", ".safetensors") or path.exists() else shipped(str(name))
 
 

@@ -236,8 +236,8 @@ def from_numbers(text: str) -> InitialBias:
 
 def training_source(model: BiasModel) -> str:
     """Source of the model's prior in words."""
-    if "prior" in model.card:  # a model that was not trained names the source of its bias
-        return str(model.card["prior"])
+    if not model.card or "prior" in model.card:  # a model that was not trained names the source of its bias
+        return str(model.card.get("prior", "zero, as an untrained model has no prior"))
     logs = model.card.get("logs", ())
     return f"prior of {len(logs)} runs" if isinstance(logs, list | tuple) and len(logs) > 1 else PRIOR
 

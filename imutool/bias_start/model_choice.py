@@ -23,7 +23,7 @@ from imutool.bias_start.bias_tracking import Samples
 from imutool.bias_start.earlier_load import with_earlier_load
 from imutool.bias_start.fitness import CHECKED_S, head, judge
 from imutool.bias_start.initial_bias import (
-    PRIOR,
+    METHODS,
     InitialBias,
     NoRestError,
     bias_prior,
@@ -31,6 +31,7 @@ from imutool.bias_start.initial_bias import (
     model_samples,
     smoothed_start,
     tracked_from_prior,
+    training_source,
 )
 from imutool.bias_start.stretches import Sieve, measured
 from imutool.cleaning import Survey, cleaned
@@ -51,12 +52,16 @@ from imutool.recording import Imu, Recording, nanoseconds, seconds
 HEAD_S = 60.0  # start of a log that the search for the initial bias reads
 
 
-def check_smooth(init: str, smooth: bool) -> None:
-    """Refuse smoothing with a given initial bias, because smoothing estimates its own.
+def check_start(init: str, smooth: bool) -> None:
+    """Refuse an unknown start, and smoothing with a given one: it estimates its own.
 
     Raises:
-        ConfigError: `smooth` with an `init` other than `auto`.
+        ConfigError: an `init` that is none, or `smooth` with an `init` other than `auto`.
     """
+    if init.startswith("truth:"):
+        truth_seconds(init)
+    elif init not in METHODS:
+        from_numbers(init)
     if smooth and init != "auto":
         raise ConfigError(f"`smooth` with `init={init}`", where="smooth", expected="`init=auto`", fix="Give one of the two")
 
@@ -73,7 +78,7 @@ def find_initial_bias(init: str, model: BiasModel, recording: Recording) -> Init
     imu = recording.imu if good.all() else recording.imu.rows(good)
     recording = replace(recording, imu=without_drift(model, imu))
     if init == "prior":
-        return replace(tracked_from_prior(model, int(recording.imu.t_ns[0])), how=PRIOR, follows=None)
+        return replace(tracked_from_prior(model, int(recording.imu.t_ns[0])), how=training_source(model), follows=None)
     if init == "truth" or init.startswith("truth:"):
         return from_truth(model, recording, truth_seconds(init))
     from_samples = {"stationary": at_rest, "auto": auto}.get(init)

@@ -46,7 +46,7 @@ def clean(
     from imutool.cleaning.rule import chosen
 
     rules = chosen(rule or (), no_rule or (), force, fix)
-    given = {"--model": model, "--smooth": smooth, "--force": force, "--fix": fix}
+    given = {"--model": model, "--init": init != "auto", "--smooth": smooth, "--force": force, "--fix": fix}
     given["--overwrite"] = common.overwrite and report_to is None and common.json_to is None
     if target is None and (idle := [name for name, value in given.items() if value]):
         raise ConfigError(f"{idle[0]} needs OUT", where="clean", fix="Name the log to be written")

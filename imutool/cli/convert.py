@@ -178,7 +178,7 @@ def export(
 
 @app.command(epilog="Example: [bold]imutool new-converter my_logger[/]")
 def new_converter(
-    name: Annotated[str, typer.Argument(help="Name on the command line, such as my_logger.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name on the command line, such as my_logger.")],
     folder: Annotated[
         Path | None, typer.Option("--output", "--folder", "-o", metavar="DIR", help="New folder; by default imutool-NAME.")
     ] = None,

@@ -106,7 +106,7 @@ def evaluate(
 
         require_matplotlib()
     results: list[dict[str, Any]] = []
-    loaded, asked = [], aid or ("stops" if zupt else None)
+    loaded, asked = [], ",".join(filter(None, (aid, "stops" if zupt else None))) or None
     errors: list[ImutoolError] = []
     with common.progress("Evaluating") as tell:
         for done, log in enumerate(logs):

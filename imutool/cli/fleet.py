@@ -118,11 +118,11 @@ def debias(
     imu: Imus = None,
 ) -> Settings:
     """Debias every log, as `imutool debias --clean` does."""
-    from imutool.bias_start.model_choice import check_smooth
+    from imutool.bias_start.model_choice import check_start
     from imutool.fleet.task import with_model_hash
     from imutool.mcap_io.verify import check_mode
 
-    check_smooth(init, smooth)
+    check_start(init, smooth)
     check_mode(verify)
     if pages:
         from imutool.viewing.html.drawing import require_matplotlib

@@ -13,6 +13,8 @@ from imutool.cli.terminal import log_to_stderr, logger, say, write_json
 from imutool.errors import ConfigError, DataError
 from imutool.report import Report, Section
 
+LONGEST_S = 75.0  # of a case's trajectory
+
 
 class MotionQuality(Section, frozen=True):
     """Noise of the poses and of the smoothed motion, with glitches and steps removed."""
@@ -119,7 +121,7 @@ def conceal(
     noise: Annotated[str, typer.Option(help="any, adis16448, bmi160, navigation or a TOML file.")] = "any",
     longest: Annotated[
         float, typer.Option(min=20.0, metavar="SECONDS", help="Use at most this much of the trajectory.")
-    ] = 75.0,
+    ] = LONGEST_S,
     truth: Truth = None,
     open_it: Annotated[bool, typer.Option("--open", help="Open the envelope in DIR and score DIR/findings.json.")] = False,
     findings: Annotated[Path | None, typer.Option(help="Score this findings file (with --open).")] = None,
@@ -138,6 +140,10 @@ def conceal(
     if len(places) != (1 if open_it else 2):
         expected = "DIR alone" if open_it else "TRAJECTORY and DIR"
         raise ConfigError(f"{len(places)} places are named", where="conceal", expected=expected)
+    made = {"--seed": seed is not None, "--kind": kind != "any", "--size": size != "any", "--noise": noise != "any"}
+    made |= {"--longest": longest != LONGEST_S, "--truth": truth is not None}
+    if open_it and (idle := [name for name, given in made.items() if given]):
+        raise ConfigError(f"{idle[0]} is of a case that is made", where="conceal", fix="Leave it out, or --open")
     if open_it:
         _open(places[0], findings, json_to, overwrite)
         return

@@ -10,7 +10,7 @@ import msgspec
 
 from imutool import __version__
 from imutool.errors import ConfigError, redact
-from imutool.file_location import absolute
+from imutool.file_location import absolute, local
 
 Command = Literal["debias", "repair", "info", "diagnose"]
 Status = Literal["ok", "lost", "failed", "quarantined", "skipped"]
@@ -71,7 +71,7 @@ def with_model_hash(settings: Settings) -> Settings:
 
     name = settings.model
     if name is not None and Path(name).suffix.lower() in {".safetensors", ".toml"}:
-        path = absolute(Path(name))
+        path = absolute(local(name, "model"))
         if path.suffix.lower() == ".safetensors":
             find_model(path)  # before a thousand logs say the same
         return msgspec.structs.replace(settings, model=str(path), model_sha256=digest(path))

@@ -22,6 +22,8 @@ from imutool.units import SENSORS, Sensor
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
+Lengths = Annotated[tuple[Positive, ...], msgspec.Meta(min_length=1)]
+Counts = Annotated[tuple[Count, ...], msgspec.Meta(min_length=1)]
 LINEAR: Mapping[Sensor, tuple[str, ...]] = {sensor: (f"{sensor}_misalignment", f"{sensor}_scale") for sensor in SENSORS}
 MIN_RESIDUAL = 1e-6  # rad or m/s: no truth is better, and perfect data must not outweigh the prior beyond float64's digits
 
@@ -32,8 +34,8 @@ class IncrementSettings(Settings, frozen=True):
     See `imutool.training.objectives.increments`.
     """
 
-    gyro_samples: tuple[Count, ...] = (16, 32)  # lengths of the increments of attitude
-    accel_samples: tuple[Count, ...] = (16, 32)  # the same of velocity
+    gyro_samples: Counts = (16, 32)  # lengths of the increments of attitude
+    accel_samples: Counts = (16, 32)  # the same of velocity
     stretch_s: Positive = 16.0  # whose increments all count in a step
 
 
@@ -103,9 +105,9 @@ class TrainSettings(Settings, frozen=True):
     The defaults here are those of linear and neural_ode; `settings_of` has those of any method.
     """
 
-    seed: int = 0  # of the random numbers: first weights, batches
-    gyro_window_s: tuple[Positive, ...] = (1.0, 4.0, 15.0)  # windows between true poses whose end the attitude has to reach
-    accel_window_s: tuple[Positive, ...] = (0.5, 2.0)  # the same for the velocity
+    seed: Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)] = 0  # of the random numbers: first weights, batches
+    gyro_window_s: Lengths = (1.0, 4.0, 15.0)  # windows between true poses whose end the attitude has to reach
+    accel_window_s: Lengths = (0.5, 2.0)  # the same for the velocity
     samples: Count = 8_000  # in a step, of windows from all logs
     steps: Count = 300  # of the descent of one sensor
     gyro_rate: Positive = 1e-2  # learning rate of the gyro's descent

@@ -213,6 +213,7 @@ def test_it_comes_back_from_its_file_in_single_precision(model: BiasModel, saved
         assert kept.dtype == np.float64
         assert np.array_equal(kept, value.astype(np.float32).astype(np.float64)), name
     assert (back.card["name"], back.card["sha256"]) == (model.method, model_file.digest(saved))
+    assert find_model(saved.as_uri()).card == back.card
     seen = segment(11, 2, 300)
     np.testing.assert_allclose(streamed(back, seen, []), streamed(model, seen, []), rtol=1e-5, atol=1e-6)  # seven digits
 

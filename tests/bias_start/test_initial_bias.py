@@ -644,6 +644,7 @@ def test_each_word_finds_its_way(biased: Recording) -> None:
         find_initial_bias("stationary", trained, moving)
     with pytest.raises(DataError, match="does not start at rest"):
         find_initial_bias("auto", static.Model(), moving)  # no training runs, no prior to fall back on
+    assert find_initial_bias("prior", static.Model(), moving).how == "zero, as an untrained model has no prior"
 
 
 @pytest.mark.parametrize("way", ["auto", "stationary", "truth"])

@@ -617,6 +617,8 @@ def test_the_command_conceals_and_opens(
     opened = json.loads((tmp_path / "score.json").read_text())
     assert_valid(opened)
     assert opened["schema"] == "imutool.score/1"
+    done = imutool("conceal", "--open", "case", "--seed", "0", cwd=tmp_path)
+    assert (done.returncode, "--seed is of a case that is made" in done.stderr) == (3, True)
     done = imutool("conceal", "--open", "nowhere", cwd=tmp_path)
     assert done.returncode == 4
     assert "Traceback" not in done.stderr

@@ -220,8 +220,9 @@ def test_rules_are_named_and_a_wrong_name_suggests_the_nearest(folder: Path, imu
     assert (wrong.returncode, "Did you mean 'spikes'?" in wrong.stderr) == (3, True)
     both = imutool("clean", "spoiled.mcap", "--rule", "spikes", "--no-rule", "spikes", cwd=folder)
     assert both.returncode == 3
-    idle = imutool("clean", "spoiled.mcap", "--force", cwd=folder)
-    assert (idle.returncode, "needs OUT" in idle.stderr) == (3, True)
+    for words in (["--force"], ["--init", "truth"]):
+        idle = imutool("clean", "spoiled.mcap", *words, cwd=folder)
+        assert (idle.returncode, f"{words[0]} needs OUT" in idle.stderr) == (3, True)
 
 
 def test_findings_in_the_metadata_are_bounded(folder: Path, tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def start_text(trace: Trace) -> str:
     known = {
         "auto": " from a start without truth",
         "stationary": " from a start at rest",
-        "prior": " from the mean bias of the training runs",
+        "prior": " from the prior of the model",
         "smooth": " with the bias smoothed over the whole log",
     }
     return known.get(method, " from a given bias" if method else "")

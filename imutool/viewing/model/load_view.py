@@ -16,6 +16,7 @@ from imutool import __version__
 from imutool.array_types import Bool
 from imutool.bias.model import GAP_S
 from imutool.bias_start.aided_path import residual_prior
+from imutool.bias_start.model_choice import check_start
 from imutool.errors import ConfigError
 from imutool.file_location import Location
 from imutool.inertial.aids import Aids, listed, parse_aids
@@ -57,10 +58,11 @@ def load(
     With `aid` there is an aided path of each model too, of the raw samples where there is no model.
 
     Raises:
-        ConfigError: the log or the folder cannot be read; two models of one name; `smooth` with another `init` than auto.
+        ConfigError: the log or the folder cannot be read; two models of one name; an `init` that is none; `smooth` with one.
         LogError, DataError: no IMU, a log from which nothing can be recovered, an invalid findings.json, or as `build`.
         ModelError: a model that cannot be used with this log.
     """
+    check_start(init, smooth)
     asked = None if aid is None else parse_aids(aid)
     contents = read_log(log, imu=imu, truth=truth)
     release_memory()
@@ -76,8 +78,7 @@ def load(
     events, notes = survey_events(contents.survey)
     with_models, aided, origins = _with_models(recording, models, init, str(log), smooth, aids, notes)
     if findings is not None:
-        start_ns, end_ns = int(recording.imu.t_ns[0]), int(recording.imu.t_ns[-1])
-        more_events, more_notes = finding_events(findings, str(log), start_ns, end_ns)
+        more_events, more_notes = finding_events(findings, str(log), *recording.imu.t_ns[[0, -1]].tolist())
         events, notes = [*events, *more_events], [*notes, *more_notes]
     raw = Run.raw(recording.imu)
     if aids is not None:

@@ -187,6 +187,8 @@ def test_smooth_reaches_the_models_and_is_refused_with_another_start(log: Path) 
     assert load(log, models=["static"], smooth=True).provenance["smooth"] == "yes"
     with pytest.raises(ConfigError, match="smooth"):
         load(log, models=["static"], smooth=True, init="prior")
+    with pytest.raises(ConfigError, match="init: 'trut'"):
+        load(log, init="trut")
 
 
 def test_an_aided_path_is_that_of_evaluate_and_has_no_samples_of_its_own(log: Path) -> None:
