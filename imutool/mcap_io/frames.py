@@ -29,7 +29,7 @@ def read_frames(log: Log, start_ns: int | None = None, end_ns: int | None = None
 
 def _format(log: Log, topic: str) -> str | None:
     """Image format, from the first image; None where it is no image."""
-    payload = log.firsts([topic]).get(topic)
+    payload = dict(log.firsts([topic])).get(topic)
     try:
         return "" if payload is None else decode_image(payload, log.topics[topic].message_encoding)[1]
     except LogError as error:

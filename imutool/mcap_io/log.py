@@ -235,20 +235,21 @@ class Log:
             with self.named(topic):
                 yield from described.decode_poses(rows)
 
-    def firsts(self, topics: Collection[str]) -> dict[str, bytes]:
-        """First messages of some topics, in a pass that ends with the last of them."""
-        wanted, found = {channel: topic for topic in topics for channel in self.channel_ids(topic)}, dict[str, bytes]()
+    def firsts(self, topics: Collection[str]) -> Iterator[tuple[str, bytes]]:
+        """First messages of some topics, in a pass that ends with the last of them; together they may not fit in memory."""
+        wanted, found = {channel: topic for topic in topics for channel in self.channel_ids(topic)}, set[str]()
         channels = set(wanted)
         with self.named():
             for block in (block for block in self.index.blocks if channels and block.may_hold(channels)):
                 if (read := self.index.unpack_or_lose(block)) is None:
                     continue
                 for channel, table in sorted(read.entries(channels).items(), key=lambda entries: int(entries[1][0, 1])):
-                    at = int(table[0, 1])
+                    at, topic = int(table[0, 1]), wanted[channel]
                     end = at + HEAD.size + HEAD.unpack_from(read.data.data, at)[1]
-                    found.setdefault(wanted[channel], read.data[at + messages.MESSAGE.itemsize : end].tobytes())
+                    if topic not in found:
+                        found.add(topic)
+                        yield topic, read.data[at + messages.MESSAGE.itemsize : end].tobytes()
                 channels = {channel for channel in channels if wanted[channel] not in found}
-        return found
 
     def channel_ids(self, topic: str) -> set[int]:
         """Channels of a topic; for a joined IMU those of its gyroscope."""

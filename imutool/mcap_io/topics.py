@@ -224,7 +224,7 @@ def topics_of(index: LogIndex) -> dict[str, Topic]:
 
 
 def reflected_topics(
-    index: LogIndex, topics: Mapping[str, Topic], firsts: Callable[[Collection[str]], Mapping[str, bytes]]
+    index: LogIndex, topics: Mapping[str, Topic], firsts: Callable[[Collection[str]], Iterator[tuple[str, bytes]]]
 ) -> dict[str, Topic]:
     """IMUs and poses among the topics whose type is not that of ROS.
 
@@ -233,15 +233,17 @@ def reflected_topics(
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
     found: dict[str, Topic] = {}
     reflected = {n: t for n, t in topics.items() if t.message_encoding in REFLECTED and RECORDED_KEY not in t.metadata}
-    first = firsts([name for name, topic in reflected.items() if topic.message_encoding == "json"])
+    in_json = [name for name, topic in reflected.items() if topic.message_encoding == "json"]
+    texts_of = {name: definition.data if (definition := definitions[name]) else b"" for name in reflected}
+    by_first = {name: reflect("json", name, topics[name].schema_name, texts_of[name], raw) for name, raw in firsts(in_json)}
     for name, topic in reflected.items():
-        schema = definition.data if (definition := definitions[name]) else b""
+        schema = texts_of[name]
         try:
             several = TYPE.fullmatch(topic.schema_name)
             if several and (form := format_of(topic.message_encoding, topic.schema_name, schema)):
                 found[name] = _as_ros(topic, Transforms(form, bool(several[1])))
                 continue
-            message = reflect(topic.message_encoding, name, topic.schema_name, schema, first.get(name))
+            message = by_first.get(name) or reflect(topic.message_encoding, name, topic.schema_name, schema, None)
         except ImportError:
             continue
         if message is not None:

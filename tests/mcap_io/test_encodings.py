@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -174,6 +175,36 @@ def test_long_lists_are_no_channels_and_hide_no_other_number(tmp_path: Path) -> 
         assert numeric_fields(log, "/scan", long=False) == ["speed"]
         assert len(numeric_fields(log, "/scan")) == 65
     assert read_field(to_location(str(path)), "/scan.scan[69999]").values[-1] == 3 / 7.0
+
+
+@pytest.mark.parametrize("encoding", ["json", "protobuf"])
+def test_a_long_message_is_never_made_into_objects(tmp_path: Path, encoding: str) -> None:
+    made, schema = protobuf(described("State", {"x": "double", "legs": "Leg[]"}, {"Leg": {"force": "float"}}), "State")
+    long = {
+        "json": b'{"x": [' + b"[]," * 3_000_000 + b"1]}",
+        "protobuf": made(x=1.0).SerializeToString() + b"\x12\0" * 5_000_000,
+    }
+    path = write(tmp_path / "long.mcap", schema if encoding == "protobuf" else ("", "", b""), encoding, [long[encoding]], "/x")
+    tracemalloc.start()
+    with Log(to_location(str(path))) as log, pytest.raises(LogError, match="more than 8388608 bytes"):
+        numeric_fields(log, "/x")
+    assert tracemalloc.get_traced_memory()[1] < 12 * len(long[encoding])
+    tracemalloc.stop()
+
+
+def test_first_messages_are_held_one_at_a_time(tmp_path: Path) -> None:
+    with (path := tmp_path / "many.mcap").open("wb") as file:
+        writer = Writer(file, chunk_size=1)
+        writer.start()
+        for k in range(40):
+            writer.add_message(writer.register_channel(f"/t{k}", "json" if k % 2 else "x", 0), k, b" " * 1_000_000, k)
+        writer.finish()
+    tracemalloc.start()
+    assert not others(to_location(str(path)), "")
+    with Log(to_location(str(path))) as log:
+        assert len(log.topics) == 40
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
 
 
 def test_a_message_that_lacks_a_number_is_a_gap_and_a_damaged_one_an_error(tmp_path: Path) -> None:

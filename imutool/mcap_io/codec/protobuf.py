@@ -10,7 +10,7 @@ from typing import Any
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 
-from imutool.mcap_io.codec.formats import DEEPEST, MAX_FIELDS, MAX_ROW, Path
+from imutool.mcap_io.codec.formats import DEEPEST, MAX_FIELDS, MAX_ROW, Path, refuse_long
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,7 @@ class Protobuf:
         """Type of that name in a FileDescriptorSet; None where the schema is damaged or lacks it."""
         pool = descriptor_pool.DescriptorPool()
         try:
+            refuse_long(schema)
             for file in descriptor_pb2.FileDescriptorSet.FromString(schema).file:
                 pool.Add(file)
             return Protobuf(message_factory.GetMessageClass(pool.FindMessageTypeByName(name)))
@@ -38,8 +39,9 @@ class Protobuf:
         """Message from its bytes.
 
         Raises:
-            ValueError: they are no such message.
+            ValueError: they are no such message, or too many.
         """
+        refuse_long(raw)
         try:
             return self.kind.FromString(raw)
         except DecodeError as error:

@@ -176,7 +176,7 @@ def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
     Raises:
         LogError: no schema, or another encoding.
     """
-    return _numeric(log, topic, log.firsts([topic]).get(topic), long=long)
+    return _numeric(log, topic, dict(log.firsts([topic])).get(topic), long=long)
 
 
 def _numeric(log: Log, topic: str, message: bytes | None, *, long: bool) -> list[str]:
@@ -199,10 +199,9 @@ def others(
     with PlainLog(path) as log:
         readers, remaining = dict[str, Reader](), READ_FACTOR * maximum
         asked = {name: topic for name, topic in log.topics.items() if name not in skip and not topic.is_derived}
-        first = log.firsts(asked)
+        offered_by = {name: _offered(log, name, message) for name, message in log.firsts(asked)}
         for name, topic in asked.items():
-            paths = _offered(log, name, first.pop(name, None))
-            paths = [inside for inside in paths if f"{name}.{inside}" != signal and not _NO_CHANNEL.search(inside)][:remaining]
+            paths = [p for p in offered_by.get(name, ()) if f"{name}.{p}" != signal and not _NO_CHANNEL.search(p)][:remaining]
             if paths:
                 readers[name], remaining = Reader(log, topic, tuple(paths), strict=False), remaining - len(paths)
         for name, rows in log.rows(list(readers)):
@@ -212,7 +211,7 @@ def others(
     return dict(islice(((name, values) for name, values in offered if values is not None), maximum))
 
 
-def _offered(log: Log, topic: str, message: bytes | None) -> list[str]:
+def _offered(log: Log, topic: str, message: bytes) -> list[str]:
     """Numeric fields of a topic, none where it has no readable definition."""
     try:
         return _numeric(log, topic, message, long=False)

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from imutool.errors import LogError
-from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec import ros2_definition, schemas
+from imutool.mcap_io.codec.formats import MAX_FIELDS
+from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.recording import Times
@@ -54,18 +56,40 @@ def plan_import(data: RunData, scope: Scope) -> ImportPlan:
             )
         with RecoveredLog(data.source) as log:
             topics = tuple(log.topics.values())
+            endless = tuple(log.index.channels[i].topic for i in sorted(log.index.channels) if _is_endless(log.index, i))
     except (OSError, LogError) as error:
         return ImportPlan(sentence=f"{NOT_SHOWN}: {error}")
     drawn = {data.provenance[key] for key in ("IMU", "truth") if key in data.provenance}
     drawn |= {TRUE_BIAS[kind] for kind in data.true_bias}
     left_out = tuple(topic.name for topic in topics if topic.name in drawn or topic.metadata.get(DERIVED_KEY) in drawn)
-    sentence = ""
+    left_out += endless
+    sentence = f"{', '.join(endless)} not shown: the definition has too many fields, or is none." if endless else ""
     if scope and (frames := tuple(topic.name for topic in topics if topic.schema_name in (schemas.TF, schemas.TRANSFORM))):
         left_out += frames  # a viewer has one set of frames, and both logs would move the same ones
-        sentence = f"Its transforms ({', '.join(frames)}) are not shown: the other logs may name the same frames."
+        sentence += " " * bool(sentence)
+        sentence += f"Its transforms ({', '.join(frames)}) are not shown: the other logs may name the same frames."
     names = [topic.name.split("/") for topic in topics if topic.schema_name == schemas.IMAGE and topic.count]
     cameras = tuple(_entity_of_topic(entity_path((), *filter(None, parts)), data, scope) for parts in names)
     return ImportPlan(True, left_out, cameras, sentence)
+
+
+def _is_endless(index: LogIndex, channel: int) -> bool:
+    """Whether a channel's definition is too large for Rerun, which takes each nested message anew and cannot be stopped."""
+    schema = index.schemas.get(index.channels[channel].schema_id)
+    if schema is None or schema.encoding != "ros2msg":
+        return False
+    try:
+        definition = ros2_definition.parse(schema.name, schema.data)
+    except LogError:
+        return True
+    sizes: dict[str, int] = {}
+
+    def size(kind: str) -> int:
+        if kind not in sizes:
+            sizes[kind] = sum(1 + (size(field.kind) if field.kind in definition else 0) for field in definition[kind])
+        return sizes[kind]
+
+    return size("") > MAX_FIELDS
 
 
 def log(data: RunData, to: rr.RecordingStream, scope: Scope) -> list[str]:

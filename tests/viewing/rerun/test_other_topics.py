@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from PIL import Image
 from support import saved_rrd
 
@@ -134,6 +135,21 @@ def test_a_log_too_large_for_a_viewer_is_left_out_and_said(
     assert CAMERA not in found
     assert "The log's other topics are not shown" in report(found)
     assert "Cameras" not in saved_rrd.names(layout.blueprint([data]).root_container.contents[1])
+
+
+def test_a_definition_that_doubles_with_each_message_is_not_given_to_rerun(data: RunData, tmp_path: Path) -> None:
+    parts = ["M1 a\nM1 b\n", *(f"MSG: p/M{k}\nM{k + 1} a\nM{k + 1} b\n" for k in range(1, 20)), "MSG: p/M20\nfloat64 x\n"]
+    with (path := tmp_path / "endless.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        for topic, text in (("/endless", f"{'=' * 80}\n".join(parts)), ("/sound", "float64 x\n")):
+            schema = writer.register_schema("p/msg/M0", "ros2msg", text.encode())
+            writer.add_message(writer.register_channel(topic, "cdr", schema), 0, b"\0\1\0\0" + bytes(8), 0)
+        writer.finish()
+    plan = other_topics.plan_import(replace(data, source=path), ())
+    assert "/endless" in plan.left_out
+    assert "/sound" not in plan.left_out
+    assert "/endless not shown" in plan.sentence
 
 
 @pytest.mark.parametrize("content", [b"", b"no log at all", b"\x89MCAP0\r\n" + bytes(100)])
