@@ -223,7 +223,7 @@ def _cut_held(columns: Columns, before: dict[str, str], clocks: dict[str, np.nda
     Joins of tables leave it so (`pandas.merge_asof`).
     """
     different = {clock: len(np.unique(columns.values[clock])) for clock in clocks if clock in columns.values}
-    finest, apart = max(different, key=lambda clock: different[clock], default=""), Columns()
+    finest, separate = max(different, key=lambda clock: different[clock], default=""), Columns()
     spelled = {c: name_and_unit(c, columns.units.get(c, ""))[0] for c in columns.values}
     for clock in [c for c in before if 1 < different.get(c, 0) < different[finest]]:
         is_still = np.diff(columns.values[clock].astype(float)) == 0.0
@@ -234,16 +234,18 @@ def _cut_held(columns: Columns, before: dict[str, str], clocks: dict[str, np.nda
             continue
         rows = np.concatenate([[True], ~is_still]) & clocks[clock]
         for column in sorted(of, key=lambda c: c != clock):
-            _take_rows(columns, column, rows, apart, f"{before[clock]}/{'time' if column == clock else column}")
+            _take_rows(columns, column, rows, separate, f"{before[clock]}/{'time' if column == clock else column}")
             del spelled[column]
-        apart.units[f"{before[clock]}/time"] = columns.units.get(clock) or name_and_unit(clock, "")[1]
+        separate.units[f"{before[clock]}/time"] = columns.units.get(clock) or name_and_unit(clock, "")[1]
         columns.remarks.notes.append(f"{is_still.sum()} rows repeat the samples beside {clock!r}, which are taken once")
-    for column in spelled if apart.values else ():
+    for column in spelled if separate.values else ():
         group, name = before.get(finest) or finest, "time" if column == finest else column
-        _take_rows(columns, column, clocks[finest], apart, f"{group}/{name}")
-        apart.units |= {f"{group}/time": columns.units.get(finest) or name_and_unit(finest, "")[1]} if column == finest else {}
-    if apart.values:
-        columns.values, columns.units, columns.texts = apart.values, apart.units, apart.texts
+        _take_rows(columns, column, clocks[finest], separate, f"{group}/{name}")
+        separate.units |= (
+            {f"{group}/time": columns.units.get(finest) or name_and_unit(finest, "")[1]} if column == finest else {}
+        )
+    if separate.values:
+        columns.values, columns.units, columns.texts = separate.values, separate.units, separate.texts
 
 
 def _take_rows(columns: Columns, column: str, rows: np.ndarray, into: Columns, name: str) -> None:

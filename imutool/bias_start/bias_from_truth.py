@@ -54,22 +54,6 @@ Rows = Float64[np.ndarray, "n 3"]
 Quaternions = Float64[np.ndarray, "n 4"]
 
 
-def truth_seconds(init: str) -> float:
-    """Seconds of `truth:SECONDS`.
-
-    Raises:
-        ConfigError: not a positive number.
-    """
-    text = init.partition(":")[2] or str(TRUTH_S)
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < math.inf:
-        raise ConfigError(f"{init!r}", where="init", expected="truth:SECONDS, for instance truth:5")
-    return value
-
-
 def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S) -> InitialBias:
     """Initial bias from up to `truth_s` seconds of true poses and the prior; gaps do no harm.
 

@@ -24,6 +24,7 @@ from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.result import Curve, Estimate, Finding
 from imutool.diagnosis.wording.quantity import grouped, stated_parameters
 from imutool.sensor import catalogue
+from imutool.sensor.effects.gyro_scale import SCALES
 from imutool.units import AXES
 
 ALIKE_STD = 4.5  # joint deviations: chance exceeds them in 0.5 % (Student's t of ten blocks, the largest of nine numbers)
@@ -51,7 +52,7 @@ def shared(finding: Finding, sim_findings: Sequence[Finding]) -> bool:
 def _reversed_axes(findings: Sequence[Finding]) -> Iterator[str]:
     """Remark on axes that read the opposite of the motion: no sensor has an error of scale below -1."""
     for finding in findings:
-        scales = finding.parameters if finding.effect in ("gyro_scale", "accel_scale") else {}
+        scales = finding.parameters if finding.effect in SCALES else {}
         if axes := ", ".join(axis for axis, s in scales.items() if axis in AXES and s.value + s.std < -1.0):
             yield f"{finding.signal} {axes}: it reads the opposite of the motion, as an axis that is reversed does"
 

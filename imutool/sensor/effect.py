@@ -54,7 +54,7 @@ class Parameter:
         matters only together with an amplitude (a time constant, a frequency) has its plausible size there.
     step: the largest step whose difference is still a derivative, of the logarithm if `positive`.
     begins: it is the time (s from the log's start) at which the effect sets in, never if infinite; a fit tries all times.
-    least, most: the smallest value and the largest size that are an answer; without `maximum`, a few times the plausible size.
+    minimum, maximum: smallest value and largest size that are an answer; without `maximum`, a few times the plausible size.
     fixed_in_training: the value that training gives a parameter in which the effect is not linear.
     """
 

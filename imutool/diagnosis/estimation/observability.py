@@ -21,7 +21,7 @@ from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.effect import ONCE_MORE, Effect, Theta
 from imutool.sensor.effects import low_pass, vibration
 from imutool.sensor.effects.gyro_hysteresis import play
-from imutool.sensor.effects.gyro_scale import STEP
+from imutool.sensor.effects.gyro_scale import SCALES, STEP
 
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
 SHARED, STANDS_STILL = "share", 0.4  # variant of a hysteresis; of the motion, what such a share moves at least
@@ -38,6 +38,7 @@ PLAINER = {  # of one that is no better: another effect, and its parameters, by 
     "gyro_scale_drift": ("gyro_scale_temperature", range(3)),
     "gyro_hysteresis": ("gyro_delay", range(1)),
 }
+REVERSED = -2.0  # error of scale of an axis that reads the opposite of the motion
 SITES_M_S2 = 0.04  # 9.764 to 9.834 m/s² on Earth
 REPLACES = {WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": LOW_PASSES, LOW_PASSES[1]: LOW_PASSES[:1]}
 """What would cancel together."""
@@ -108,12 +109,12 @@ def with_free(effect: Effect, free: Sequence[int], sensors: tuple[str, ...] = ()
 
 
 def without_implausible(effect: Effect, theta: Theta, factor: float) -> Effect:
-    """Effect without implausible parameters (`factor` times, or `maximum`), which fit noise."""
-    if effect.kind != "catalogue" or not (effect.linear or effect.variant == STEP):
-        return effect
+    """Effect without implausible parameters, which fit noise; an axis may be reversed."""
     maximum = [factor * n.plausible if n.maximum is None else n.maximum for n in effect.parameters]
-    free = [k for k, n in enumerate(effect.parameters) if n.begins or abs(theta[k]) <= maximum[k]]
-    return with_free(effect, free if any(not effect.parameters[k].begins for k in free) else [])
+    size = np.minimum(np.abs(theta), np.abs(theta - REVERSED)) if effect.name in SCALES else np.abs(theta)
+    free = [k for k, n in enumerate(effect.parameters) if n.begins or size[k] <= maximum[k]]
+    judged = effect.kind == "catalogue" and (effect.linear or effect.variant == STEP)
+    return with_free(effect, free if any(not effect.parameters[k].begins for k in free) else []) if judged else effect
 
 
 def with_steady_clock(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect], starts: Starts) -> Fit:

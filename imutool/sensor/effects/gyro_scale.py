@@ -22,14 +22,14 @@ def _forward(samples: SensorSamples, s: Theta) -> SensorSamples:
 
 def of_form(effect: Effect, names: Container[str]) -> Effect:
     """A scale from one time on if `t_step` is among the names, any other effect itself."""
-    return _from_one_time_on(effect) if effect.name in _SCALES and T_STEP.name in names else effect
+    return _from_one_time_on(effect) if effect.name in SCALES and T_STEP.name in names else effect
 
 
 def in_both_forms(effects: Sequence[Effect]) -> Iterator[Effect]:
     """Effects, and behind each scale one that sets in at one time."""
     for effect in effects:
         yield effect
-        if effect.name in _SCALES:
+        if effect.name in SCALES:
             yield _from_one_time_on(effect)
 
 
@@ -61,7 +61,7 @@ def _from_one_time_on(whole: Effect) -> Effect:
     )
 
 
-_SCALES = ("gyro_scale", "accel_scale")
+SCALES = ("gyro_scale", "accel_scale")
 EFFECT = Effect(
     "gyro_scale",
     Stage.SENSOR,
