@@ -136,7 +136,7 @@ def linearise(seen: Seen, terms: Terms, part: Part, own_prior: Float[Tensor, " o
         if step > len(sets) and settled:
             break
         to, covariance = problem.solve(range(len(prior)))
-        if step == len(sets) - 1:  # windows of all lengths, and the prior is weak for the last time
+        if step == len(sets) - 1 and len(seen.pool.spans_ns) >= FOLDS:  # windows of all lengths, the last step of a weak prior
             prior = _with_reversed_axes(prior, problem, list(terms.linear))
         settled = bool(((to - theta).abs() < SETTLED * covariance.diagonal().sqrt()).all())
         theta, own = to, problem.own_at(to)

@@ -218,6 +218,7 @@ def test_a_number_is_unidentified_if_it_is_as_unsure_as_it_is_large(
     ("name", "theta", "left"),
     [
         ("lever_arm", (3.2, -0.6, 40.0), ["x", "y"]),  # it may sit metres from the tracked point
+        ("gyro_scale", (0.01, -1.8, 0.02), ["x", "y", "z"]),  # an axis that reads the opposite, as FETCH's gyro about y
         ("gyro_scale", (-1.0, 0.01, 0.02), ["y", "z"]),  # the motion is noise of the poses, and a scale of -1 takes it away
         ("gyro_scale:step", (-1.0, -0.97, 0.02, 2.2), ["z", "t_step"]),
         ("gyro_scale:step", (-1.0, -0.97, 3.0, 2.2), []),
