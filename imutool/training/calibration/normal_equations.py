@@ -27,7 +27,7 @@ from imutool.sensor.signals import Signals
 from imutool.training.calibration.closed_form import end_samples, median_per_log, nuisance_jacobian, window_sets
 from imutool.training.calibration.log_scatter import LogPieces, shown_by_logs, sums_by_log, widest
 from imutool.training.calibration.shared_parameters import Equations, Problem
-from imutool.training.settings import LINEAR, SensorPrior
+from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Part, Pool
 from imutool.units import Sensor
 
@@ -39,7 +39,6 @@ REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of m
 SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
 SETTLED, MAX_STEPS = 0.2, 40  # deviations by which a step moves a parameter at most; steps with windows of all lengths
 WEAK = 0.01  # of a prior's precision, that of the prior at first
-SURE = 2.0  # standard deviations by which a scale exceeds that of an axis with nothing but noise
 FOLDS = 3  # parts of a log where there are fewer logs than this
 
 
@@ -72,24 +71,18 @@ class Seen(NamedTuple):
 class Terms(NamedTuple):
     """Errors that are linear in parameters theta, the product of `pattern` and the values.
 
-    `prior` is one over the variance of each parameter, about zero; `linear` are the columns of scale and misalignment.
+    `prior` is one over the variance of each parameter, about zero.
     """
 
     values: Float[Tensor, "n q"]
     pattern: Float[Tensor, "3 q p"]
     prior: Float[Tensor, " p"]
-    linear: Sequence[int] = ()
 
     @classmethod
     def of(cls, effects: Sequence[LinearForm], signals: Signals, sensors: SensorPrior, pool: Pool) -> Terms:
         """Terms of some effects."""
         prior = np.concatenate([np.zeros(0), *map(sensors.std_of, effects)]) ** -2.0
-        names = [effect.name for effect in effects for _ in effect.parameters]
-        linear = [k for k, name in enumerate(names) if any(name in of_sensor for of_sensor in LINEAR.values())]
-        values, pattern, precision = (
-            torch.from_numpy(x).to(pool.t) for x in (terms_of(effects, signals), patterns(effects), prior)
-        )
-        return cls(values, pattern, precision, linear)
+        return cls(*(torch.from_numpy(x).to(pool.t) for x in (terms_of(effects, signals), patterns(effects), prior)))
 
 
 class WindowSet(NamedTuple):
@@ -136,23 +129,9 @@ def linearise(seen: Seen, terms: Terms, part: Part, own_prior: Float[Tensor, " o
         if step > len(sets) and settled:
             break
         to, covariance = problem.solve(range(len(prior)))
-        if step == len(sets) - 1 and len(seen.pool.spans_ns) >= FOLDS:  # windows of all lengths, the last step of a weak prior
-            prior = _with_reversed_axes(prior, problem, list(terms.linear))
         settled = bool(((to - theta).abs() < SETTLED * covariance.diagonal().sqrt()).all())
         theta, own = to, problem.own_at(to)
     return problem
-
-
-def _with_reversed_axes(prior: Float[Tensor, " p"], problem: Problem, linear: list[int]) -> Float[Tensor, " p"]:
-    """Prior with wide scales of axes that read the opposite of the motion; no data sheet has those.
-
-    The poses are fitted by the samples, so an axis with nothing but noise has a scale of 1, and a reversed one of 2.
-    """
-    theta, covariance = problem.solve(linear)
-    is_reversed = theta[linear].abs() - SURE * covariance.diagonal().sqrt() > 1.0
-    out = prior.clone()
-    out[linear] = torch.where(is_reversed, theta[linear] ** -2.0, prior[linear])
-    return out
 
 
 def _prefix(seen: Seen, pieces: Pieces, terms: Terms, true_u: Float[Tensor, "n 3"], turned: dict[int, Tensor]) -> Prefix:

@@ -122,17 +122,6 @@ def test_an_effect_far_beyond_its_prior_is_not_held_back_by_it(flights: list[Rec
     np.testing.assert_allclose(calibration.theta.numpy(), planted_theta(effects, 10.0), rtol=0.05)
 
 
-def test_an_axis_that_reads_the_opposite_of_the_motion_is_found_as_a_scale(flights: list[Recording]) -> None:
-    """The prior says 5 %, which holds back a scale of 2 where the axis turns little, as on a floor."""
-    driven = [planar(flight, pitch_rad=1e-3) for flight in flights]
-    opposite = [replace(drive, imu=replace(drive.imu, gyro=drive.imu.gyro * (1.0, -1.0, 1.0))) for drive in driven]
-    pool = Pool.of([measured(flight, (), np.zeros(0), seed) for seed, flight in enumerate(opposite)])
-    calibration = calibrate(pool, "gyro", pool.gyro)
-    assert set(calibration.effects) == set(LINEAR["gyro"])
-    planted = [2.0 * (key == ("gyro_scale", "y")) for key in of_effects(calibration.effects, "gyro")]
-    np.testing.assert_allclose(calibration.theta.numpy(), planted, atol=0.15)
-
-
 def test_a_clock_that_all_flights_share_is_found(three: Callable[[int], list[Recording]]) -> None:
     """3 ms: logs that agree share it, though each may have a clock of its own."""
     effects = catalogue.trained("gyro", ["clock_offset"])
