@@ -161,7 +161,7 @@ def _by_units(units: dict[str, float], names: dict[str, tuple[str, str]]) -> lis
     found: dict[str, dict[str, str]] = {}
     for column in [column for column, (_, unit) in names.items() if unit in units]:
         match = re.fullmatch(r"(?P<of>.*?)_?(?P<axis>[xyz])|(?P<first>[xyz])_(?P<rest>.*)", split_name(leaf_of(column))[0])
-        if match and not re.search(rf"{BIAS}|{ESTIMATED}", spaced_name(column)):
+        if match and not re.search(rf"{BIAS}|{ESTIMATED}|(^|_)b_", spaced_name(column)):
             of, axis = group_of(column) + (match["of"] or match["rest"] or ""), match["axis"] or match["first"]
             found.setdefault(of, {})[axis] = column
     whole = [each for each in found.values() if {*each} == {*"xyz"}]

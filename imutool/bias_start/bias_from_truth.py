@@ -28,7 +28,6 @@ from imutool.cleaning.rules.saturation import at_limit
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
-from imutool.inertial.windows import HUBER_MEDIANS
 from imutool.log_info.convention_report import check_start_poses
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
 from imutool.recording.columns import median
@@ -48,6 +47,7 @@ SAME = 100.0  # samples whose poses have the same error
 PARTS, CONTRADICTED = 3, 22.5  # of a start; chi-square of their scatter on three axes, exceeded once in a thousand usual starts
 MIN_TRUTH_STD = np.array([5e-5] * 3 + [2e-3] * 3)  # rad/s and m/s²: no poses show a bias better
 ITERATIONS = 4
+HUBER_MEDIANS = 1.5  # threshold of an outlier, in medians of the residuals, as `inertial.windows`, which imports PyTorch
 MAX_TURN_RAD = 2.0  # by a bias: a turn is known up to pi, so that of a larger bias begins near the median of its steps
 
 Rows = Float64[np.ndarray, "n 3"]

@@ -109,7 +109,7 @@ def test_a_steady_drive_is_no_stop() -> None:
 
 
 @pytest.mark.parametrize(
-    ("walk", "truth_noise", "least", "most"),
+    ("walk", "truth_noise", "minimum", "maximum"),
     [
         (1e-5, 1e-3, 3e-6, 5e-5),  # a quiet sensor
         (1e-5, 6e-3, 3e-5, 1e-4),  # poses that hide the walk: it is as usual, and their noise is none

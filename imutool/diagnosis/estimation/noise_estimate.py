@@ -84,7 +84,7 @@ def _check_rows(pair: Pair, band: Band) -> None:
     if not counts or min(counts) < MIN_ROWS * order:
         step_s, rows, minimum = pair.period_s * band.every, min(counts, default=0), MIN_ROWS * order
         raise DataError(
-            f"its poses show motion below {pair.band_hz:.3g} Hz; {rows} values every {step_s:.2g} s have no gap",
+            f"its poses show motion below {pair.band_hz:.3g} Hz; {rows} values every {step_s:.2g} s are there without a gap",
             where=pair.name,
             expected=f"{minimum} or more",
             fix="Record longer, with fewer gaps, or with poses at a higher rate",

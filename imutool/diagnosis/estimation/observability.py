@@ -133,23 +133,18 @@ def with_steady_clock(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Ef
 
 def with_plainer_effects(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with the plainer of two effects where the other is not clearly better (BIC)."""
-    for effect, _ in base.chosen:  # each is the same as long as it stays
-        base = with_plainer(logs, base, effect, named, base.logs[0].pair.settings.search.clearly_better)
-    return base
-
-
-def with_plainer(logs: Sequence[WhitenedLog], base: Fit, complex_one: Effect, named: Sequence[Effect], margin: float) -> Fit:
-    """Fit with a plainer effect for one that is not better by a margin (BIC)."""
     poses = any(log.pair.band_hz is not None for log in logs)
-    sizes = _plainer(complex_one, next(theta for effect, theta in base.chosen if effect is complex_one), poses=poses)
-    rest = tuple(entry for entry in base.chosen if entry[0] is not complex_one)
-    plainer = [effect for effect in named if effect.name in sizes and effect.key not in base.keys]
-    parts = [(with_free(e, sizes[e.name][0], complex_one.sensors), np.array(sizes[e.name][1])) for e in plainer]
-    maximum = bic(base) + margin * max(1.0, base.reduced_chi_square)
-    limits = [maximum - parameter_cost(base, (*rest, part)) for part in parts]
-    trials = [fit(logs, (*rest, part), near=base, give_up_above=at) for part, at in zip(parts, limits, strict=True)]
-    best = min(trials, key=bic, default=base)
-    return best if bic(best) < maximum else base
+    for complex_one, theta in base.chosen:
+        sizes = _plainer(complex_one, theta, poses=poses)
+        rest = tuple(entry for entry in base.chosen if entry[0] is not complex_one)
+        plainer = [effect for effect in named if effect.name in sizes and effect.key not in base.keys]
+        parts = [(with_free(e, sizes[e.name][0], complex_one.sensors), np.array(sizes[e.name][1])) for e in plainer]
+        margin = base.logs[0].pair.settings.search.clearly_better * max(1.0, base.reduced_chi_square)
+        limits = [bic(base) + margin - parameter_cost(base, (*rest, part)) for part in parts]
+        trials = [fit(logs, (*rest, part), near=base, give_up_above=at) for part, at in zip(parts, limits, strict=True)]
+        best = min(trials, key=bic, default=base)
+        base = best if bic(best) < bic(base) + margin else base
+    return base
 
 
 def _plainer(effect: Effect, theta: Theta, *, poses: bool) -> Mapping[str, tuple[Sequence[int], Sequence[float]]]:

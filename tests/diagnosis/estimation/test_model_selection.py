@@ -900,21 +900,6 @@ def test_a_name_that_leaves_no_more_takes_the_place_of_a_term() -> None:
     assert list(search.simplified(fit([log], ((term, np.zeros(1)),))).keys) == ["accel_misalignment"]
 
 
-def test_what_leaves_the_trial_leaves_what_it_surely_was() -> None:
-    """A gyro's lag that changes with the rate had a filter of unsure form, and without it a jump of both sensors' clock."""
-    pair = planted.pair(planted.rich(2), {"gyro_delay": [0.007], "clock_offset": [0.004], "gyro_scale": [0.02, 0.0, 0.01]})
-    log, named = planted.weighed(pair), catalogue.diagnosed(["clock_jump", "clock_offset", "gyro_delay", "gyro_scale"])
-    by_name, settings = {effect.name: effect for effect in named}, log.pair.settings.search
-    known = Candidates([log], named)
-    search = model_selection._Search([log], named, (), (), settings, lambda text: None, known, before=0.0)
-    (filtered,) = (
-        one for one in in_forms(catalogue.effects(["second_order_low_pass"]), exact=True) if one.sensors == ("gyro",)
-    )
-    scale = planted.acting({"gyro_scale": [0.02, 0.0, 0.01]})
-    begun = ((filtered, np.array([45.0, 1.0])), (by_name["clock_jump"], np.array([0.05, 0.004])), *scale)
-    assert set(search._without(fit([log], begun, iterations=0), 0).keys) == {"gyro_delay", "clock_offset", "gyro_scale"}
-
-
 def test_a_filter_of_one_sensor_leaves_the_offset_of_clocks_without_an_epoch_in_every_fit() -> None:
     """The form of the filter did without that offset, and was then taken for it: a low-pass of 5 Hz was no finding."""
     candidates = in_forms(catalogue.diagnosed(["clock_offset", "low_pass", "second_order_low_pass"]), exact=True)

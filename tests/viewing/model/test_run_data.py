@@ -297,7 +297,7 @@ def test_a_short_curve_is_whole() -> None:
     assert len(curve_rows(np.zeros((0, 3)))) == 0
 
 
-@pytest.mark.parametrize("most", [10, 101, 1000])
+@pytest.mark.parametrize("maximum", [10, 101, 1000])
 def test_what_is_left_out_of_a_path_is_near_what_is_drawn_in_time_and_along_it(maximum: int) -> None:
     n = 20_000
     steps = np.random.default_rng(1).normal(size=(n, 3))

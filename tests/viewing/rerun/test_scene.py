@@ -181,7 +181,7 @@ def test_the_worst_moment_is_marked_where_it_is(one: RunData, entities: SimpleNa
 
 
 @pytest.mark.parametrize(
-    ("limit", "path", "most"),
+    ("limit", "path", "maximum"),
     [("MAX_CURVE_ROWS", "/imu/accel/raw", 200), ("MAX_DERIVED_ROWS", "/error/position/raw/axes", 100)],
 )
 def test_a_very_long_curve_is_thinned_with_its_extremes_kept(

@@ -12,13 +12,7 @@ from imutool.diagnosis.estimation.candidate_score import Candidates
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, SplineCurve
 from imutool.diagnosis.estimation.noise_estimate import axis_squares, is_coloured_noise, kurtosis, leaves_slow_motion
-from imutool.diagnosis.estimation.observability import (
-    LOW_PASSES,
-    beyond_the_band,
-    unidentified,
-    with_plainer,
-    with_plainer_effects,
-)
+from imutool.diagnosis.estimation.observability import beyond_the_band, unidentified
 from imutool.diagnosis.estimation.significance import (
     Scatter,
     estimate_onsets,
@@ -100,17 +94,8 @@ class Trial:
                 selected = tuple(sorted(verdicts, key=lambda verdict: -verdict.gain))
                 best = Selection(selected, fitted, whole, self.tried, first, partial(self._similar, base))
                 return self._with_error(best, base)
-            base = self._without(base, first + worst)
+            base = fit(base.logs, (*base.chosen[: first + worst], *base.chosen[first + worst + 1 :]), near=base)
         return Selection((), base, fit(base.logs, base.chosen, part="all"), self.tried, first)
-
-    def _without(self, base: Fit, k: int) -> Fit:
-        """The fit without an effect.
-
-        Of a filter of unsure numbers the delay stays, and of a jump at the start an offset.
-        """
-        effect, others = base.chosen[k][0], (*base.chosen[:k], *base.chosen[k + 1 :])
-        delayed = with_plainer(base.logs, base, effect, self.named, np.inf) if effect.name == LOW_PASSES[1] else base
-        return with_plainer_effects(base.logs, fit(base.logs, others, near=base) if delayed is base else delayed, self.named)
 
     def _similar(self, tested: Fit) -> dict[str, tuple[str, ...]]:
         base = self._with_own_noise(tested)
