@@ -22,7 +22,7 @@ from imutool.conversion.corrections import CONVENTIONS, NOT_TURNED, STAMPS, Corr
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.restamping import find_stamps
 from imutool.log_info.imu_samples import ImuSamples
-from imutool.log_info.pose_imu_rotation import Body, body_of, frames_of_copies, is_straight, turned_body
+from imutool.log_info.pose_imu_rotation import Body, agreement_in, body_of, frames_of_copies, is_straight, turned_body
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
@@ -30,6 +30,7 @@ from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.storage.target import copy_file
 from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES
 from imutool.recording.message_log import Message, MessageLog
+from imutool.units import AXES
 
 MAX_ROUNDS = 4  # quaternions first, then the clock of poses, which hides a turned body, which hides a wrong world
 AS_RECORDED = np.stack([np.eye(3)] * 2)  # axes of gyro and accel
@@ -63,6 +64,9 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             elif mount is not None and _one_is_straight(log, before, survey.pose_topic):
                 survey, mount = replace(survey, axes=np.stack([mount] * 2)), None
             before.append(topic)
+            hidden = frame_id or survey.pose_delay_ns or survey.quaternions or (survey.matrices != np.eye(3)).any()
+            if survey.pose_topic and mount is None and not hidden:
+                survey = replace(survey, axes=np.stack([_gyro_axes(log, topic, survey.pose_topic), np.eye(3)]))
             patched = described.reflected is None or isinstance(described.reflected, Reflected)
             if not patched or described.message_encoding not in ENCODINGS:
                 if mount is not None or (survey.matrices != np.eye(3)).any():
@@ -93,6 +97,13 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
 def _one_is_straight(log: Log, imus: Sequence[str], pose_topic: str) -> bool:
     """Whether an IMU lies as the body of the poses does."""
     return any(is_straight(log, ImuSamples(log, topic), pose_topic) for topic in imus)
+
+
+def _gyro_axes(log: Log, topic: str, pose_topic: str) -> Float64[np.ndarray, "3 3"]:
+    """Axes of a gyro that hold against poses: some may read the opposite."""
+    found = agreement_in(log, ImuSamples(log, topic), pose_topic)
+    axes = "" if found is None else found.reversed_axes
+    return np.diag([-1.0 if axis in axes and len(axes) < len(AXES) else 1.0 for axis in AXES])
 
 
 def _imu_note(survey: Survey) -> str:

@@ -147,10 +147,10 @@ def _agreement(
     explained = max(0.0, 1.0 - (rms / motion) ** 2)
     as_recorded = 1.0 - float(((gyro - omega)[kept] ** 2).sum(axis=1).mean()) / motion**2
     seen = explained > MIN_EXPLAINED
-    body = rotation_deg(turn, gyro[kept], omega[kept], float(end[-1] - begin[0])) if seen else None
+    opposite = reversed_axes(gyro[kept], omega[kept]) if seen else ""  # then no turned body explains the rates
+    body = rotation_deg(turn, gyro[kept], omega[kept], float(end[-1] - begin[0])) if seen and not opposite else None
     if body is not None and body.std_deg.max() >= np.clip(UNSURE_SHARE * np.linalg.norm(body.deg), *UNSURE_DEG):
         body = None
-    opposite = reversed_axes(gyro[kept], omega[kept]) if seen else ""
     return Agreement(rms, explained, as_recorded, body, len(jumps), float(jumps.max(initial=0.0)), opposite)
 
 
@@ -173,8 +173,7 @@ def body_warnings(topic: str, turned_deg: Sequence[float], explained: float, as_
 def reversed_warnings(topic: str, axes: str) -> list[str]:
     """Warning of axes of the gyro that read the opposite of poses; other rules find all three."""
     what = f"the gyro reads turns about {', '.join(axes)} with the opposite sign of the poses {topic}: its axes are left-handed"
-    fix = "Reverse them in the source (of a table, --map gyro=gx,-gy,gz)"
-    return [f"{what}. {fix}"] if 0 < len(axes) < len(AXES) else []
+    return [f"{what}; {CORRECTION}"] if 0 < len(axes) < len(AXES) else []
 
 
 def _is_far(turned_deg: Sequence[float] | Float64[np.ndarray, " 3"]) -> bool:
@@ -231,27 +230,26 @@ class Body(NamedTuple):
 
 def turned_body(log: Log, imu: ImuSamples, topic: str) -> Body | None:
     """Body of poses that is turned by more than `TURNED_DEG`."""
-    found = _turned_in(log, imu, topic)
-    if found is None or not _is_far(found.deg):
+    found = agreement_in(log, imu, topic)
+    if found is None or found.turned is None or not _is_far(found.turned.deg):
         return None
-    return body_of(log, topic, quaternion.matrix(quaternion.exp(np.radians(found.deg)[None]))[0])
+    return body_of(log, topic, quaternion.matrix(quaternion.exp(np.radians(found.turned.deg)[None]))[0])
 
 
 def is_straight(log: Log, imu: ImuSamples, topic: str) -> bool:
     """Whether an IMU shows that it lies as the body of poses does."""
-    found = _turned_in(log, imu, topic)
-    return found is not None and not _is_far(found.deg)
+    found = agreement_in(log, imu, topic)
+    return found is not None and found.turned is not None and not _is_far(found.turned.deg)
 
 
-def _turned_in(log: Log, imu: ImuSamples, topic: str) -> Turned | None:
-    """Rotation of the body of poses in a log; None where they do not show it."""
+def agreement_in(log: Log, imu: ImuSamples, topic: str) -> Agreement | None:
+    """Agreement of the poses of a log with an IMU; None where the two share too little motion."""
     if (poses := read_truth(log, topics=[topic])) is None:
         return None
     turns = GyroTurns(poses, imu.sound.steps.median())
     for samples in imu:
         turns.see(samples.stamp_ns, samples.values[:, :3])
-    found = turns.agreement()
-    return None if found is None else found.turned
+    return turns.agreement()
 
 
 def body_of(log: Log, topic: str, turn: Float64[np.ndarray, "3 3"]) -> Body:

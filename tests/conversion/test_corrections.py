@@ -21,6 +21,7 @@ from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD
 from imutool.conversion.common_setup import fitted_to, shared
 from imutool.conversion.corrections import RECORD, Corrections
 from imutool.conversion.run import convert
+from imutool.converters import fetch
 from imutool.errors import LogError
 from imutool.evaluation import evaluate
 from imutool.log_info.inspection import inspect
@@ -216,6 +217,24 @@ def test_short_logs_are_corrected_as_the_others_of_their_setup_and_a_right_one_s
         turns = [Rotation.from_quat(poses.q_wb_wxyz.copy(), scalar_first=True) for poses in (fixed, true)]
         assert np.degrees((turns[0] * turns[1].inv()).magnitude()).max() < 2.0, name
         np.testing.assert_allclose(fixed.p_wb, true.p_wb, atol=0.05, err_msg=name)
+
+
+def test_an_axis_of_a_gyro_that_reads_the_opposite_is_reversed_also_where_a_log_is_too_short_to_show_it(
+    data: Path, tmp_path: Path
+) -> None:
+    """FETCH's gyro is left-handed (y); the robot of 07_left_turn pitches and rolls too little to show it."""
+    names = ("05_random", "06_right_turn", "07_left_turn")
+    (tmp_path / "fetch").mkdir()
+    for name in names:
+        (tmp_path / "fetch" / name).symlink_to(data / "fetch" / name)
+    report = convert(tmp_path / "fetch", tmp_path / "out", fix=True, workers=1)
+    assert [note for note in report.notes if "left-handed" in note] == []
+    for name in names:
+        (recorded,) = fetch.read(data / "fetch" / name)
+        fixed = read(tmp_path / "out" / f"{name}.mcap").imu
+        np.testing.assert_array_equal(fixed.gyro, recorded.imu.gyro * (1.0, -1.0, 1.0), err_msg=name)
+        np.testing.assert_array_equal(fixed.accel, recorded.imu.accel, err_msg=name)
+        assert not any("opposite sign" in warning for warning in inspect(tmp_path / "out" / f"{name}.mcap").warnings)
 
 
 def test_a_log_whose_poses_have_another_delay_does_not_get_that_of_the_others(tmp_path: Path) -> None:
