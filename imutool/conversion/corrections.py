@@ -28,10 +28,12 @@ from imutool.mcap_io.codec.encode import NO_ORIENTATION
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.recovery.losses import LATEST_NS
 from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES, VELOCITY_KEY
+from imutool.mcap_io.write import RECORD as OWN
 from imutool.recording.message_log import Message, MessageLog, MessageTopic
 
 RECORD = "imutool_corrections"
 CONVENTIONS, STAMPS = "conventions", "stamps"  # what may be corrected
+TURNED = ", axes corrected"  # behind the name of a sensor
 XYZW_FROM_WXYZ, WXYZ_FROM_XYZW = [1, 2, 3, 0], [3, 0, 1, 2]
 NOT_TURNED = Body(np.eye(3), frozenset())
 
@@ -83,6 +85,9 @@ class Corrections:
         earlier = content.metadata.get(RECORD, {})  # of another round, or of an earlier command
         record = {topic: "; ".join(filter(None, (earlier.get(topic), note))) for topic, note in self.notes.items()}
         metadata = {**content.metadata, RECORD: {**earlier, **record}}
+        own, turned = content.metadata.get(OWN, {}), any((np.sign(axes) != np.eye(3)).any() for axes in self.imus.values())
+        if turned and "sensor" in own and not own["sensor"].endswith(TURNED):  # a model of it as recorded does not fit any more
+            metadata[OWN] = {**own, "sensor": own["sensor"] + TURNED}
         return replace(content, messages=lambda: self._after_zero(content), metadata=metadata)
 
     def _after_zero(self, content: MessageLog) -> Iterator[Message]:

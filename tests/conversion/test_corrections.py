@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool import registry
 from imutool.api.models import debias as debias_log
+from imutool.bias.model_file import shipped_for
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD
 from imutool.conversion.common_setup import fitted_to, shared
 from imutool.conversion.corrections import RECORD, Corrections
@@ -235,6 +236,10 @@ def test_an_axis_of_a_gyro_that_reads_the_opposite_is_reversed_also_where_a_log_
         np.testing.assert_array_equal(fixed.gyro, recorded.imu.gyro * (1.0, -1.0, 1.0), err_msg=name)
         np.testing.assert_array_equal(fixed.accel, recorded.imu.accel, err_msg=name)
         assert not any("opposite sign" in warning for warning in inspect(tmp_path / "out" / f"{name}.mcap").warnings)
+        about = read(tmp_path / "out" / f"{name}.mcap").metadata["imutool"]
+        assert about["sensor"] == "fetch, axes corrected"
+        assert shipped_for({**about, "sensor": "fetch"})
+        assert shipped_for(about) == [], "their models are of the axes as recorded"
 
 
 def test_a_log_whose_poses_have_another_delay_does_not_get_that_of_the_others(tmp_path: Path) -> None:
