@@ -173,7 +173,8 @@ def body_warnings(topic: str, turned_deg: Sequence[float], explained: float, as_
 def reversed_warnings(topic: str, axes: str) -> list[str]:
     """Warning of axes of the gyro that read the opposite of poses; other rules find all three."""
     what = f"the gyro reads turns about {', '.join(axes)} with the opposite sign of the poses {topic}: its axes are left-handed"
-    return [f"{what}; {CORRECTION}"] if 0 < len(axes) < len(AXES) else []
+    fix = "imutool convert LOG OUT --fix reverses them"  # a model may learn from such a log, and no command refuses it
+    return [f"{what}; {fix}"] if 0 < len(axes) < len(AXES) else []
 
 
 def _is_far(turned_deg: Sequence[float] | Float64[np.ndarray, " 3"]) -> bool:
