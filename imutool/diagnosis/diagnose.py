@@ -122,7 +122,7 @@ def _beside_reference(
     settings: DiagnoseSettings,
     begin: Sequence[Finding],
 ) -> tuple[Diagnosis, Selection | None]:
-    """Diagnosis of recordings against a simulation or their own poses, with remarks that were `remarks_read` as they were read.
+    """Diagnosis of recordings against a simulation or their own poses; `remarks_read` are those of reading them.
 
     The selection of effects comes with it; none without a reference.
     """

@@ -238,7 +238,7 @@ def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile
     acting = physics.acting()
     covered, before, after = [], [], []
     for log in logs:
-        on_its_clock = [_on_clock_of(gain, motion.start_ns, log.pair) for gain in ideals]
+        on_its_clock = [_on_clock_of(ideal, motion.start_ns, log.pair) for ideal in ideals]
         plain, simulated = (_read(log.pair, on_its_clock, [*effects, *clock]) for effects in ((), acting))
         finite = np.isfinite(plain).all(axis=1) & np.isfinite(simulated).all(axis=1)
         given = expected(log.pair, clock)

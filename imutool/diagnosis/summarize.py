@@ -116,7 +116,7 @@ def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Fi
     or not, is the body's motion, or their own, as at a camera's rate.
     """
     (vibration,) = catalogue.diagnosed(["vibration"])
-    pair = max((log.pair for log in logs), key=lambda line: len(line.stamp_s))
+    pair = max((log.pair for log in logs), key=lambda aligned: len(aligned.stamp_s))
     several = len({log.pair.name for log in logs}) > 1
     if several or pair.band_hz is None or any(effect.key == vibration.key for effect, _ in chosen):
         return []

@@ -40,9 +40,9 @@ class Stuck(Rule):
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
         """Yield the samples without repeats."""
         for around, core in padded(stream, MIN):
-            same, alternates = _repeats(around.values)
+            same, in_runs = _repeats(around.values)
             self._noisy = _noisy(around.values[~same], self._noisy)
-            samples, repeated = around.where(core), alternates[core]
+            samples, repeated = around.where(core), in_runs[core]
             self._equal += int(same[core].sum())
             self._pairs += len(repeated)
             if repeated.any():
@@ -122,8 +122,8 @@ class _Axis:
 
 def repeated(values: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
     """Samples that repeat the one before, in runs of `MIN` and more, of a sensor with noise."""
-    same, alternates = _repeats(values)
-    return alternates & _noisy(values[~same], before=False)
+    same, in_runs = _repeats(values)
+    return in_runs & _noisy(values[~same], before=False)
 
 
 def _repeats(values: Float64[np.ndarray, "n 6"]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
@@ -133,11 +133,11 @@ def _repeats(values: Float64[np.ndarray, "n 6"]) -> tuple[Bool[np.ndarray, " n"]
     """
     equal = np.concatenate([np.zeros((1, 6), bool), np.diff(values, axis=0) == 0])[: len(values)]
     same: Bool[np.ndarray, " n"] = np.asarray(equal.all(axis=1))
-    alternates = np.zeros(len(same), bool)
+    in_runs = np.zeros(len(same), bool)
     for first, end in true_ranges(same):
         around = [equal[k].sum() for k in (first - 1, end) if 0 < k < len(same)]
-        alternates[first:end] = end - first >= MIN - 1 and not (around and max(around) > MAX_EQUAL)
-    return same, alternates
+        in_runs[first:end] = end - first >= MIN - 1 and not (around and max(around) > MAX_EQUAL)
+    return same, in_runs
 
 
 def _noisy(values: Float64[np.ndarray, "n 6"], before: bool) -> bool:

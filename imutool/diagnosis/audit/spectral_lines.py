@@ -121,7 +121,7 @@ def _cause(f_hz: float, rate_hz: float, power: float, shown: Shown) -> Cause:
 
 def _is_hidden(f_hz: float, rate_hz: float, power: float, shown: Shown) -> bool:
     """Whether the poses would not show a line, were it the fold of a faster motion."""
-    return any(weaker < CLEARLY * line for _, weaker, line in (shown.at(f, power) for f in (rate_hz - f_hz, rate_hz + f_hz)))
+    return any(weaker < CLEARLY * peak for _, weaker, peak in (shown.at(f, power) for f in (rate_hz - f_hz, rate_hz + f_hz)))
 
 
 def _spectrum(x: Float64[np.ndarray, "n 3"], rate_hz: float, size: int) -> Spectrum:

@@ -135,7 +135,7 @@ def _with_signal(diagnosis: Diagnosis, added: SignalDiagnosis) -> Diagnosis:
 def _with_remark(remarks: tuple[str, ...], remark: str) -> tuple[str, ...]:
     """Adds a remark on a signal; signals with the same remark share it."""
     name, _, text = remark.partition(": ")
-    for k, text_of_all in enumerate(remarks):
-        if (names := text_of_all.removesuffix(f": {text}")) != text_of_all:
+    for k, other in enumerate(remarks):
+        if (names := other.removesuffix(f": {text}")) != other:
             return (*remarks[:k], f"{names}, {name}: {text}", *remarks[k + 1 :])
     return (*remarks, remark)

@@ -55,11 +55,11 @@ def torque_constants(log: WhitenedLog, candidates: Sequence[Effect], always: Cho
     for limit in (effect for effect in candidates if effect.name == LIMIT and far & {*(effect.sensors or signal.names)}):
         limited = min((fit([log], (*limited.chosen, (limit, start))) for start in signal.starts(limit)), key=bic)
     loads = [(load, start) for load in candidates if load.name == LOAD for start in signal.starts(load)]
-    gain = signal.columns == 1  # whose load is a gain and a rotor
-    beside = (limited.chosen,) if gain else (currents, torques, limited.chosen)
+    is_single = signal.columns == 1  # whose load is a gain and a rotor
+    beside = (limited.chosen,) if is_single else (currents, torques, limited.chosen)
     late = [(delay, start) for delay in candidates if delay.name == DELAY for start in signal.starts(delay)]
     trials = [fit([log], currents), limited, *(fit([log], (*base, load)) for base in beside for load in loads)]
-    trials += [fit([log], (*base, gain)) for base in (currents, torques) for gain in late]
+    trials += [fit([log], (*base, chosen)) for base in (currents, torques) for chosen in late]
     best = {effect.key: float(theta[0]) for effect, theta in min(trials, key=bic).chosen}
     constants = {name: best.get(effect.key, 1.0) for name, effect in zip(first, gains, strict=True)}
     return np.array(list(constants.values())) if _far(constants) else None

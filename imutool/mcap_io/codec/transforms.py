@@ -51,8 +51,8 @@ class Transforms:
         for frames, group in groupby(read, key=lambda entry: [transform.frames for transform in entry[1]]):
             rows, messages = zip(*group, strict=True)
             if frames:
-                stamps = np.array([[transform_read.stamp_ns for transform_read in message] for message in messages], np.int64)
-                values = np.array([[transform_read.values for transform_read in message] for message in messages], np.float64)
+                stamps = np.array([[each.stamp_ns for each in message] for message in messages], np.int64)
+                values = np.array([[each.values for each in message] for message in messages], np.float64)
                 yield heads[list(rows)], encode_transforms(stamps, values, frames)
 
     def _transforms(self, raw: bytes, log_time: int) -> list[Transform]:
