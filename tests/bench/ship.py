@@ -16,7 +16,12 @@ import numpy as np
 
 from imutool.bias.model_file import header_of
 
-PREFIX = {"euroc": "euroc-adis16448", "tumvi": "tum_vi-bmi160", "fetch": "fetch"}
+PREFIX = {
+    "adis16448": "euroc-adis16448",
+    "bmi160": "tum_vi-bmi160",
+    "fetch": "fetch",
+    "fetch, axes corrected": "fetch_axes_corrected",
+}
 METHODS = ("linear", "conv", "neural_ode", "hybrid")
 MAX_BYTES = 2_000_000
 COMMAND = "imutool train {logs} -o {name}.safetensors --method {method} --seed {seed}"
@@ -29,13 +34,13 @@ LIMITS = (
 def main() -> None:
     """One line a model."""
     tables, target = map(Path, sys.argv[1:3])
-    for data_set, prefix in PREFIX.items():
+    for data_set in ("euroc", "tumvi", "fetch"):
         for method in METHODS:
             found = sorted(tables.glob(f"{data_set}-{method}-[0-9].safetensors"))
             if not found:
                 continue
             best = min(found, key=lambda path: float(header_of(path)["held_out"]["gyro"]["error"]))
-            name = f"{prefix}-{method}"
+            name = f"{PREFIX[header_of(best)['sensor']]}-{method}"
             if best.stat().st_size > MAX_BYTES:
                 raise SystemExit(f"{best} has {best.stat().st_size} bytes, more than {MAX_BYTES}")
             shutil.copyfile(best, target / f"{name}.safetensors")
