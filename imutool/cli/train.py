@@ -73,9 +73,10 @@ def train(
             progress=lambda epoch: tell(*epoch_line(epoch)),
         )
     if not common.write(training_report(place, trained.card), replace=resume):
-        if "left_out" in trained.card and not common.quiet:
+        if not common.quiet:
             with redirect_stdout(sys.stderr):  # how the model was chosen is no result
-                left_out_table(trained.card["left_out"])
+                if "left_out" in trained.card:
+                    left_out_table(trained.card["left_out"])
                 for line in lines_of_choice(trained.card):
                     say(line)
                 if channel := getattr(trained.config, "temperature", UNSET):
@@ -118,7 +119,7 @@ def left_out_table(left_out: Mapping[str, Any]) -> None:
 
 
 def lines_of_choice(card: Mapping[str, Any]) -> list[str]:
-    """Effects of each sensor, and what the neural ODE changes on held-out time."""
+    """Effects of each sensor, and what the descent of a network changes on held-out time."""
     lines = [f"{sensor}: {', '.join(found['effects']) or 'no effect'}" for sensor, found in card.get("physics", {}).items()]
     compared = card.get("compared", {})
     if ode := compared.get("effects and neural_ode"):
@@ -129,6 +130,10 @@ def lines_of_choice(card: Mapping[str, Any]) -> list[str]:
         lines.append(f"neural ODE {kept}: held-out error of {', of '.join(errors)}")
     elif compared and len(card["logs"]) == 1:
         lines.append("no neural ODE: one log shows only what fits its own motion")
+    held_out = {sensor: found for sensor, found in card.get("held_out", {}).items() if "closed_form" in found}
+    if held_out and not compared:
+        errors = (f"{sensor} {e['closed_form']:.3g} to {e['error']:.3g} {e['unit']}" for sensor, e in held_out.items())
+        lines.append(f"held-out error, from the closed form to the network: {', '.join(errors)}")
     return lines
 
 

@@ -16,7 +16,7 @@ from imutool.training.fit import Stage, Training
 from imutool.training.objectives.objective import RobustLoss
 from imutool.units import SENSORS
 
-FORMAT = "imutool.training/2"
+FORMAT = "imutool.training/3"
 
 
 def save(training: Training, path: Path) -> None:
@@ -27,7 +27,7 @@ def save(training: Training, path: Path) -> None:
     """
     tensors = {f"model.{name}": value for name, value in training.model.state_dict().items()}
     tensors |= {"tracks": training.tracks.knots.detach(), "generator": training.generator.get_state()}
-    about: dict[str, Any] = {"identity": _identity(training), "done": training.done}
+    about: dict[str, Any] = {"identity": _identity(training), "done": training.done, "before": training.before}
     if stage := training.stage:
         about["stage"] = {"sensor": stage.sensor, "step": stage.step, "before": stage.before}
         tensors |= {f"closed_form.{name}": value for name, value in stage.closed_form.items()}
@@ -60,7 +60,8 @@ def restore(training: Training, path: Path) -> None:
         with torch.no_grad():
             training.tracks.knots.copy_(tensors["tracks"])
         training.generator.set_state(tensors["generator"])
-        training.done = {sensor: float(about["done"][sensor]) for sensor in SENSORS if sensor in about["done"]}
+        done, before = ({s: float(about[key][s]) for s in SENSORS if s in about[key]} for key in ("done", "before"))
+        training.done, training.before = done, before
         if "stage" in about:
             training.stage = _stage(training, about["stage"], tensors)
     except (KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:

@@ -14,6 +14,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -43,6 +44,7 @@ OBJECTIVES: dict[str, type[Objective]] = {"window_ends": WindowEndObjective, "in
 WARM_UP_STEPS = 20
 AVERAGE_STEPS = 30  # over which weights are averaged
 SEED_STRIDE = 1_000_003  # between the seeds of two steps
+ERROR_UNITS = {"gyro": "rad", "accel": "m/s"}  # of the held-out errors
 TRIM = 0.9  # the worst tenth of the held-out windows is where the truth has outliers
 
 
@@ -121,6 +123,7 @@ class Training:
         self.tracks = RestBiases(self.pool, self.settings.track_knot_s)
         self.generator = torch.Generator().manual_seed(self.settings.seed)
         self.done: dict[Sensor, float] = {}  # held-out error of each finished stage
+        self.before: dict[Sensor, float] = {}  # that of its closed form
         self.stage: Stage | None = None
         self.turn_on: bias_spread.TurnOn | None = None
 
@@ -141,6 +144,7 @@ class Training:
             else:
                 self.model.load_state_dict(self.stage.closed_form)
             self.stage.objective.settle()
+            self.before[sensor] = self.stage.before
             self.done[sensor], self.stage = last if kept else self.stage.before, None
         if statistics:
             self.store_statistics()
@@ -152,6 +156,11 @@ class Training:
             self.model, pool or self.pool, self.tracks.per_log().detach(), self.settings.window_s
         )
         self.model.requires_grad_(False)
+
+    def errors(self) -> dict[str, Any]:
+        """Error of each sensor on held-out time; of a descent also that of the closed form from which it began."""
+        before = {s: {"closed_form": error} for s, error in self.before.items() if self.model.iterative}
+        return {s: {"error": error, "unit": ERROR_UNITS[s], **before.get(s, {})} for s, error in self.done.items()}
 
     def held_out(self, sensor: Sensor, model: BiasNetwork) -> float:
         """Error over the longest windows that fit the held-out parts: the mean without the worst tenth (rad or m/s)."""

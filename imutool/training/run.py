@@ -42,7 +42,6 @@ from imutool.training.settings import LINEAR, TrainSettings, settings_for
 from imutool.training.training_windows import Pool, check_trainable
 from imutool.units import SENSORS, Sensor
 
-UNITS = {"gyro": "rad", "accel": "m/s"}
 logger = logging.getLogger(__name__)
 
 LogErrors = Mapping[Sensor, Float64[np.ndarray, " logs"]]
@@ -172,14 +171,14 @@ def _physics_first(
             named = msgspec.structs.replace(settings, model=settings.model | simpler)
             physics = PhysicsFirst.of(recordings, named, descent.device, descent.say)
             without = descent(physics.recordings, static.Model.method, alone, statistics=False)
-    held_out: dict[str, Any] = {"effects": _held_out(without)}
+    held_out: dict[str, Any] = {"effects": without.errors()}
     kept = without
     if physics.model.config.remainder and len(recordings) > 1:  # a single log shows what fits its own motion
         shared = with_poses_of_sensor(physics.recordings, [fit.own for fit in physics.fits.values()])
         before = descent(shared, static.Model.method, alone, statistics=False)
         of_ode = physics.ode_settings(settings)
         ode = descent(shared, neural_ode.Model.method, of_ode, constant, statistics=False)
-        held_out = {"effects": _held_out(before), "effects and neural_ode": _held_out(ode)}
+        held_out = {"effects": before.errors(), "effects and neural_ode": ode.errors()}
         kept = ode if helps(*(_log_errors(training) for training in (before, ode))) else before
     if kept.turn_on is None:
         kept.store_statistics(without.pool)
@@ -187,8 +186,7 @@ def _physics_first(
     for sensor in (sensor for sensor in constant if not fits[sensor].named):
         covariance = left_out_covariance(fits[sensor], sensor)
         model.take(sensor, LINEAR[sensor], torch.zeros(len(covariance)), covariance)
-    about = {"held_out": _held_out(kept), **_turn_on(kept)}
-    return model, about | {"compared": held_out, "physics": _described(physics.fits)} | compared
+    return model, _about(kept) | {"compared": held_out, "physics": _described(physics.fits)} | compared
 
 
 def _drift_first(
@@ -217,7 +215,7 @@ def _drift_first(
             training.model.take_temperature(
                 str(physics.model.config.temperature), dict(physics.model.temperature.named_buffers())
             )
-    return training.model, {"held_out": _held_out(training), **_turn_on(training)}
+    return training.model, _about(training)
 
 
 def helps(before: LogErrors, after: LogErrors) -> bool:
@@ -256,7 +254,7 @@ def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: _
     training = descent(recordings, linear.Model.method, settings, constant)
     for sensor in constant:
         training.model.take_covariance(sensor, matrix_covariance(left_out_covariance(physics.fits[sensor], sensor)))
-    return training.model, {"held_out": _held_out(training), **_turn_on(training)} | compared
+    return training.model, _about(training) | compared
 
 
 def _network_alone(
@@ -264,7 +262,7 @@ def _network_alone(
 ) -> tuple[BiasNetwork, dict[str, Any]]:
     """Network without effects; the card's entries."""
     training = descent(recordings, method, settings)
-    return training.model, {"held_out": _held_out(training), **_turn_on(training)}
+    return training.model, _about(training)
 
 
 Trainer = Callable[[Sequence[Recording], TrainSettings, _Descent], tuple[BiasNetwork, dict[str, Any]]]
@@ -277,13 +275,10 @@ def _shared(recordings: Sequence[Recording], key: str) -> str | None:
     return values.pop() if len(values) == 1 else None
 
 
-def _held_out(training: Training) -> dict[str, Any]:
-    return {sensor: {"error": error, "unit": UNITS[sensor]} for sensor, error in training.done.items()}
-
-
-def _turn_on(training: Training) -> dict[str, Any]:
+def _about(training: Training) -> dict[str, Any]:
+    """Entries of a model card: errors on held-out time, and what the logs tell of the turn-on bias."""
     assert training.turn_on is not None, "the training has not ended"
-    return training.turn_on.card()
+    return {"held_out": training.errors(), **training.turn_on.card()}
 
 
 def _card(method: str, settings: TrainSettings, parts: Sequence[tuple[Path, Recording]]) -> dict[str, Any]:

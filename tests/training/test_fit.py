@@ -195,7 +195,7 @@ def test_a_damaged_checkpoint_is_refused(recordings: list[Recording], begun: Pat
         with pytest.raises((ModelError, ConfigError)):
             checkpoint.restore(Training(recordings, "neural_ode", TINY), path)
     path.write_bytes(whole)
-    with pytest.raises(ModelError, match=r"format 'imutool.training/2'; expected 'imutool.model/1'"):
+    with pytest.raises(ModelError, match=r"format 'imutool.training/3'; expected 'imutool.model/1'"):
         load(path)
 
 
