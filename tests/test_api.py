@@ -286,7 +286,7 @@ ZEROS = np.zeros((2, len(STILL.imu), 3))
         (lambda: imutool.clean("a.mcap", rules=[3]), "rules: is of type list; expected text or a list of texts"),
         (
             lambda: imutool.train("a.mcap", "m.safetensors", settings={"seed": "x"}),
-            "settings: seed: is text; expected an integer",
+            "settings: seed: is 'x', text; expected an integer",
         ),
         (
             lambda: imutool.train("a.mcap", "m.safetensors", settings={"steps": -1}),

@@ -245,4 +245,4 @@ def _grade(noise: str | Path, rng: Generator) -> tuple[str, Noise]:
 
 def _check(name: str, value: str, known: Sequence[str]) -> None:
     if value not in known:
-        raise ConfigError(f"`{name}` is {value!r}", where=name, expected=f"one of {', '.join(known)}")
+        raise ConfigError(f"unknown {name} {value!r}", where=name, expected=f"one of {', '.join(known)}")
