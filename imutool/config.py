@@ -119,7 +119,7 @@ def _of_value(reason: str, where: str | Path | None, values: Any) -> ConfigError
     expected, got = "", ""
     if what.startswith("Expected "):
         expected, _, got = what.removeprefix("Expected ").partition(", got ")
-        what = f"has {got} items" if got.isdigit() else f"is {_at(place, values)}{got}" if got else f"is {_at(place, values)}out of range"
+        what = f"has {got} items" if got.isdigit() else f"is {_at(place, values)}{got or 'out of range'}"
     what, expected = (re.sub(r"`([\w |]+)`", _in_words, text) for text in (what, expected))
     return ConfigError(what, where=f"{where or 'settings'}{': ' * bool(place)}{place}", expected=expected)
 

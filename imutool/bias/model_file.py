@@ -146,7 +146,7 @@ def load(path: Path) -> BiasModel:
 
 
 def library() -> Path:
-    """Folder of the shipped models: inside the installed package, or beside it in a checkout."""
+    """Folder of the shipped models: inside the installed package, or next to it in a checkout."""
     inside = Path(__file__).parents[1] / "_models"
     return inside if inside.is_dir() else Path(__file__).parents[2] / "models"
 

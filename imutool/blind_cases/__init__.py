@@ -135,7 +135,7 @@ def case_log(imu: Imu, truth: Poses, channels: Mapping[str, Scalars]) -> Recordi
 
 
 def write_case(folder: Path, sim: Recording, real: Recording, truth: ConcealedTruth) -> None:
-    """Seals a case: writes all files beside the folder, then moves each into its place.
+    """Seals a case: writes all files next to the folder, then moves each into its place.
 
     The envelope is moved last.
 

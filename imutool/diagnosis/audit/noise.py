@@ -1,4 +1,4 @@
-"""Faults of a simulated IMU's noise, digits and lines, beside a data sheet or a recording."""
+"""Faults of a simulated IMU's noise, digits and lines, by a data sheet or a recording."""
 
 from __future__ import annotations
 
