@@ -108,7 +108,7 @@ def toml(value: Any) -> str:
 
 
 def meaning_of(kind: type[Any], name: str) -> str:
-    """The comment beside a setting in the source of its class."""
+    """The comment next to a setting in the source of its class."""
     sources = (inspect.getsource(each) for each in kind.__mro__ if name in vars(each).get("__annotations__", {}))
     found = re.search(rf"^    {name}: .*?  # (.*)$", next(sources), re.MULTILINE)
     return found[1] if found else ""

@@ -411,7 +411,7 @@ def test_converting_needs_no_torch():
         (b'<?xml version="1.0"?>\n<!-- ' + 300 * b"a" + b' -->\n<mvnx version="3">', "Xsens MVN.*sensors measured"),
         (b"\x20\x0c" + 8 * (b"\xfa\xff\x36\x44" + bytes(69)), "Xsens sensor.*MT Manager"),
         (b"\x80\x04\x95\x0f\x00\x00\x00\x00\x00\x00\x00}\x94\x8c\x03acc\x94K\x01s.", "pickle of Python.*numpy.savez"),
-        (b"\x02P,\x00", "C3D file.*beside the table"),
+        (b"\x02P,\x00", "C3D file.*together with the table"),
         (
             b"#group,false\r\n#default,_result\r\n,table,_time,_value,_field\r\n,0,2024-05-01T12:00:00Z,0.1,gx\r\n",
             r"long.*Pivot",
