@@ -145,7 +145,7 @@ def section(command: Any, name: str) -> str:
     words = [word if p.required else f"[{word}]" for p, word in zip(arguments, words, strict=True)]
     lines = [f"## {name}", "", text_of(command.help), "", "```console", f"$ {' '.join([name, '[OPTIONS]', *words])}", "```", ""]
     rows = [(f"`{p.metavar or p.name}`", help_of(p)) for p in arguments]
-    rows += [(f"`{', '.join([*p.opts, *p.secondary_opts])} {value_of(p) or ''}".rstrip() + "`", help_of(p)) for p in options]
+    rows += [(f"`{', '.join([*p.opts, *p.secondary_opts])} {value_of(p)}".rstrip() + "`", help_of(p)) for p in options]
     lines += ["| argument or option | |", "|---|---|", *(f"| {left} | {cell(right)} |" for left, right in rows)]
     return "\n".join([*lines, "", *values_of(command), "", example_of(command), ""])
 

@@ -70,12 +70,13 @@ def flags(command: Any) -> dict[str, str]:
     return flag_of
 
 
-def value_of(parameter: Any) -> str | None:
-    """Word for the value of an option in a help; none for a flag and an argument, whose word is its name."""
-    if parameter.metavar or parameter.param_type_name == "argument" or parameter.is_flag:
-        return None if parameter.param_type_name == "argument" else parameter.metavar
+def value_of(parameter: Any) -> str:
+    """Word for the value of an option in a help; none for a flag, and for an argument, whose word is its name."""
+    if parameter.param_type_name == "argument" or parameter.is_flag:
+        return ""
     kind = parameter.display_type(None).strip("<>").removeprefix("list[").removesuffix("]")
-    return VALUES.get(parameter.name, parameter.name.strip("_").upper()) if kind == "str" else VALUES.get(kind, kind)
+    own = parameter.name.strip("_").upper() if kind == "str" else kind
+    return str(parameter.metavar or VALUES.get(parameter.name if kind == "str" else kind, own))
 
 
 def instead_of(option: str, command: Any) -> list[str]:
