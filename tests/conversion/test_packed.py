@@ -79,7 +79,7 @@ def converted(source: Path, out: Path) -> ConvertReport:
 
 
 def refused(source: Path, match: str) -> None:
-    """The source is refused, and nothing is left of it, neither beside the target nor anywhere above."""
+    """The source is refused, and nothing is left of it, neither next to the target nor anywhere above."""
     out = source.parents[1] / "out"
     before = sorted(source.parents[1].rglob("*"))
     with pytest.raises(DataError, match=match) as error:

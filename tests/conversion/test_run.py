@@ -304,7 +304,7 @@ def test_a_map_and_the_poses_that_it_names_are_never_the_target(tmp_path, out):
 def test_a_read_only_target_is_refused(source):
     with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):
         convert(source / "a", Path("/proc/a.mcap"))
-    with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):  # and no temporary folder beside it
+    with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):  # and no temporary folder next to it
         convert(source / "a", Path("/proc/a.mcap"), fix=True)
     with pytest.raises(ConfigError, match="/proc/imutool: cannot be made"):
         convert(source, Path("/proc/imutool"))
@@ -503,7 +503,7 @@ def test_a_folder_of_own_logs_alone_can_be_converted_again_but_never_what_it_wro
         again = convert(logs, logs / "again", overwrite=overwrite)
         assert sorted(path.name for path in again.written) == ["a.mcap", "b.mcap", "c.mcap"]
     sequence(logs / "raw")
-    (written,) = convert(logs, tmp_path / "beside").written  # own logs beside a source are none
+    (written,) = convert(logs, tmp_path / "beside").written  # own logs next to a source are none
     assert read(written).name == "raw"
 
 
@@ -583,7 +583,7 @@ def test_an_acquisition_of_st_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("jumps", [False, True])
 def test_a_topic_on_a_clock_of_its_own_is_no_jump_of_the_clock(tmp_path: Path, jumps: bool, imutool) -> None:
-    """As GNSS beside an IMU, in seconds of the week and since the start."""
+    """As GNSS next to an IMU, in seconds of the week and since the start."""
     t_s, vectors = np.arange(300) / 100.0, np.random.default_rng(5).normal([0, 0, 0, 0, 0, 9.81], 0.1, (300, 6))
     t_s[150:] += 7200.0 * jumps
     (tmp_path / "drive").mkdir()
