@@ -71,7 +71,7 @@ def flags(command: Any) -> dict[str, str]:
 
 
 def value_of(parameter: Any) -> str:
-    """Word for the value of an option in a help; none for a flag, and for an argument, whose word is its name."""
+    """Word for the value of an option in a help; empty for a flag and for an argument."""
     if parameter.param_type_name == "argument" or parameter.is_flag:
         return ""
     kind = parameter.display_type(None).strip("<>").removeprefix("list[").removesuffix("]")

@@ -159,7 +159,7 @@ def findings_table(diagnoses: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def gain_table(gains: Mapping[str, Mapping[str, Any]]) -> str:
-    """A row a test sequence: rms against its own poses, and orientation, without and with what the training sequences showed."""
+    """A row a test sequence: rms against its own poses and orientation, without and with what the training sequences showed."""
     head = ["test sequence", "gyro rms (rad/s)", "accel rms (m/s²)", "AOE raw → bias → physics (°)", "5 s windows (°)"]
     rows = []
     for name, one in gains.items():
