@@ -95,7 +95,7 @@ def _messages(rows: np.ndarray, places: list[int]) -> Messages:
 def _clock(messages: Messages) -> tuple[str, int] | None:
     """Field with the time since boot, and its unit in ns.
 
-    A GPS message of logs before 2015 has the time of the week in TimeMS, beside a Week, and the time since boot in T.
+    A GPS message of logs before 2015 has the time of the week in TimeMS, next to a Week, and the time since boot in T.
     """
     fields = messages.fields
     known = {"T": CLOCKS_NS["TimeMS"]} if "Week" in fields and "TimeUS" not in fields else CLOCKS_NS

@@ -1,4 +1,4 @@
-"""Messages of an MCAP log in log-time order, and what is beside them.
+"""Messages of an MCAP log in log-time order, and the records between them.
 
 The data section is followed record by record: an index need not list what is there.
 """

@@ -46,7 +46,7 @@ def find(source: Path) -> list[Sequence]:
         folder = named_folder(source)
         return [Sequence(folder.parent.name, folder.parent)] if folder.name == ROOT else list(_in_folder(folder))
     if not source.exists():
-        raise DataError("does not exist", where=source, expected="a folder, an archive or a bag")
+        raise DataError("does not exist", where=source, expected="a log, a table, an archive, or a folder of these")
     return _in_file(source)
 
 

@@ -31,7 +31,7 @@ from ._table_units import TIME_NS
 from ._table_wraps import begun_anew
 
 MAX_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
-SENSOR_TIME = r"(sensor|event|hardware|hw)_?(event_?)?(time|t_|ts|stamp)"  # Android's, beside the time of the program
+SENSOR_TIME = r"(sensor|event|hardware|hw)_?(event_?)?(time|t_|ts|stamp)"  # Android's, in addition to the time of the program
 
 
 def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns: Columns, given: Entries) -> None:
@@ -92,7 +92,7 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
 
 
 def _accel_time(named: list[str], time: str, spelled: dict[str, tuple[str, str]], columns: Columns, proposal: Proposal) -> str:
-    """Time of the accelerometer's own, by its name beside that of the gyro, or by its rows; else empty."""
+    """Time of the accelerometer's own, by its name next to that of the gyro, or by its rows; else empty."""
     accel = proposal.unsigned("accel", columns)
     count = len(columns.values[accel[0]]) if accel else 0
     fits = [c for c in named if c != time and len(columns.values[c]) == count and goes_on(columns.values[c])]

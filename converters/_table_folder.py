@@ -79,7 +79,7 @@ def sequences_below(source: Path) -> list[Sequence]:
     names = ((path.parent, re.sub(SPACED, "_", path.parent.name).lower(), path) for each in others for path in _tables(each))
     if true := [f"{folder.name}/{path.name}" for folder, name, path in names if re.fullmatch(POSES, name)]:
         note = f"tables of true poses in a folder without an IMU are left out: {_listed(true)}"
-        logger.warning("%s: %s. Put each beside the tables of its IMU, with ground_truth in its name", source, note)
+        logger.warning("%s: %s. Put each next to the tables of its IMU, with ground_truth in its name", source, note)
     return sequences
 
 
@@ -142,7 +142,7 @@ def load_split(folder: Path, recording: str) -> Columns:
 
 
 def _tables(folder: Path) -> list[Path]:
-    """Tables of a folder; narrow ones are a series of readings, or beside a clock, which is none of them."""
+    """Tables of a folder; narrow ones are a series of readings, or next to a clock, which is none of them."""
     files = _files(folder)
     clocks = [path for path in files if _is_clock(path)]
     narrow = {path for path in files if _is_narrow(path) and (clocks or _is_series(path))}
@@ -196,7 +196,7 @@ def _recordings(folder: Path) -> dict[str, Names]:
             return {without_role(stems[min(part)]): {path: names[path] for path in sorted(part)} for part in parts}
         return {"": first}
     labels = stems
-    for others in ({path: path.name for path in names}, names):  # imu.csv beside imu.txt, imu/1.csv beside vicon/1.csv
+    for others in ({path: path.name for path in names}, names):  # imu.csv and imu.txt, imu/1.csv and vicon/1.csv
         count = Counter(labels.values())
         labels = {path: label if count[label] == 1 else others[path] for path, label in labels.items()}
     alike: dict[str, dict[Path, str]] = {}
@@ -207,7 +207,7 @@ def _recordings(folder: Path) -> dict[str, Names]:
     for shared, paths in alike.items():
         groups = role_groups(paths)
         stem = stems[next((path for path in groups if groups[path] not in (TRUTH_GROUP, POSES_GROUP)), next(iter(paths)))]
-        name = stem if shared.replace(" ", "").isdigit() and not stem.startswith(shared) else shared  # imuRaw1 beside viconRot1
+        name = stem if shared.replace(" ", "").isdigit() and not stem.startswith(shared) else shared  # imuRaw1 and viconRot1
         own = {labels[path]: {path: names[path]} for path in paths if look(path).is_imu or look(path).header in of_imus}
         found |= {name: paths} if name and groups else own
     return found or {labels[path]: {path: names[path]} for path in names if look(path).may_be_imu}

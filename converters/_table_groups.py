@@ -33,7 +33,7 @@ from ._table_times import goes_on
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 
 Axes = dict[str, str]  # columns by x, y, z
-CALIBRATED = r"(?i)\bcalibrated\b"  # in the name of a group, beside one of raw counts
+CALIBRATED = r"(?i)\bcalibrated\b"  # in the name of a group, next to one of raw counts
 MAX_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 MIN_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
 MAX_LONGER = 10.0  # is a span of time than another in the same unit
@@ -139,7 +139,7 @@ def _own_time(columns: Columns, leaves: dict[str, str], time: str, unit: str) ->
 
 
 def turned(columns: Columns, entries: Entries) -> Entries:
-    """Entries with the orientations beside a sensor's rates, in place of poses."""
+    """Entries with the orientations next to a sensor's rates, in place of poses."""
     entries = {name: value for name, value in entries.items() if name not in TURNS}
     group, length = group_of(columns.unsigned(entries["gyro"][0])), len(columns.values[str(entries["time"])])
     beside = [c for c, values in columns.values.items() if group_of(c) == group and len(values) == length]
@@ -166,7 +166,7 @@ def _unit_of(columns: Columns, position: list[str]) -> str:
 
 
 def pose_clock(columns: Columns, entries: Entries) -> Entries:
-    """Entries of the time of rotations named without one: that beside them, or the IMU's.
+    """Entries of the time of rotations named without one: that next to them, or the IMU's.
 
     Raises:
         ConfigError: a named column does not exist.
@@ -245,7 +245,7 @@ def time_beside(columns: Columns, column: str, time: str, unit: str, *, separate
 
 
 def _with_unit(columns: Columns, other: str, time: str, unit: str, *, separate: bool) -> tuple[str, str] | None:
-    """A time beside the IMU's, and its unit.
+    """A time next to the IMU's, and its unit.
 
     A unit that is not stated is the one in which it covers the IMU's time best; of a clock `separate` from the IMU's the one in
     which it lasts about as long.
@@ -273,7 +273,7 @@ def is_time(column: str) -> bool:
 def measured(columns: Columns) -> list[str]:
     """Columns that may be a sensor's.
 
-    Poses that are true are none, nor are parameters, which are shorter, and raw counts beside what is calibrated.
+    Poses that are true are none, nor are parameters, which are shorter, and raw counts next to calibrated values.
     """
     longest = max(map(len, columns.values.values()), default=0)
     long = [c for c, values in columns.values.items() if len(values) > MAX_CONSTANTS or longest <= MAX_CONSTANTS]
@@ -282,7 +282,7 @@ def measured(columns: Columns) -> list[str]:
 
 
 def _raw_counts(columns: Columns) -> set[str]:
-    """Columns of a group `Raw` beside one `Calibrated`."""
+    """Columns of a group `Raw` next to one `Calibrated`."""
     calibrated = {re.sub(CALIBRATED, "raw", group_of(c)).lower() for c in columns.values if re.search(CALIBRATED, group_of(c))}
     return {column for column in columns.values if calibrated and group_of(column).lower() in calibrated}
 

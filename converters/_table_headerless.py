@@ -128,7 +128,7 @@ def _turning(columns: Columns, names: list[str]) -> _Halves | None:
 def _has_gravity(columns: Columns, triple: list[str], factor: float = 1.0) -> bool:
     """Whether three columns have the size of gravity, and seldom less, as rates of a fast flight about 1 rad/s have.
 
-    Zeros beside a one, as of a pose, have not.
+    Zeros next to a one, as of a pose, have not.
     """
     values = factor * np.stack([columns.values[name].astype(float) for name in triple])
     level, near = gravity_units(columns, triple, factor)

@@ -67,7 +67,7 @@ def load_json(path: Path, columns: Columns) -> None:
         if not read_rows(text, part, path):
             read_csv(text, part, path, minimum=1)
         if len(tables) == 1:
-            beside = name.removesuffix(name.rpartition(".")[2])  # as a rate beside the samples: `imu.frequency`, `imu.data`
+            beside = name.removesuffix(name.rpartition(".")[2])  # as a rate next to the samples: `imu.frequency`, `imu.data`
             columns.numbers = {number.removeprefix(beside): value for number, value in columns.numbers.items()}
             columns.values, columns.units = part.values | columns.values, part.units | columns.units
             columns.texts, columns.labels = part.texts, part.labels | columns.labels
@@ -162,7 +162,7 @@ def _is_matrix(node: Any) -> bool:
 
 
 def _names_beside(parent: Row, node: Any) -> list[str]:
-    """Names of the columns of a matrix: a list beside it of as many words, or of as many objects with a name and units."""
+    """Names of the columns of a matrix: a list next to it of as many words, or of as many objects with a name and units."""
     if not _is_matrix(node):
         return []
     for other in parent.values():

@@ -33,7 +33,7 @@ LISTS = {  # entries that name several columns
 }
 TRUE_ENTRIES = {"truth_time", "position", "quaternion_wxyz", "roll_pitch_yaw", "rotation_matrix"}  # columns of the poses
 CLOCKS = "time", "accel_time", "truth_time", "counter"
-IMU_GROUP = "imu"  # in front of the columns of an IMU beside another table
+IMU_GROUP = "imu"  # in front of the columns of an IMU next to another table
 TRUTH_GROUP, POSES_GROUP = "ground_truth", "poses"  # of that other table
 POSE_GROUPS = f"{TRUTH_GROUP}/", f"{POSES_GROUP}/"
 OF_COUNTS = {"gyro_scale", "gyro_offset", "accel_scale", "accel_offset"}
@@ -129,14 +129,14 @@ def _toml(path: Path) -> dict[str, Any]:
 def within_groups(given: Entries, columns: Columns) -> Entries:
     """Entries with the group in front of the names of columns, if one table alone has them.
 
-    A map of a folder also holds for a table without a group, which has none beside it.
+    A map of a folder also holds for a table without a group, which has none next to it.
     """
     out = dict(given)
     beside = {c for e in TRUE_ENTRIES & given.keys() for c in np.atleast_1d(given[e]).tolist() if c.startswith(POSE_GROUPS)}
     if beside and not any(column.startswith(POSE_GROUPS) for column in columns.values):
         out = {entry: value for entry, value in given.items() if entry not in {*TRUE_ENTRIES, "truth_time_unit", "pose_kind"}}
         unused = ", ".join(sorted(given.keys() - out.keys()))
-        columns.remarks.notes.append(f"no table of poses is beside it: {unused} are left out")
+        columns.remarks.notes.append(f"no table of poses lies next to it: {unused} are left out")
     for entry in {*LISTS, *CLOCKS} & out.keys():
         of_imu = entry not in TRUE_ENTRIES
         if of_imu or "truth_file" not in given:

@@ -136,7 +136,7 @@ def _cells(value: Any) -> list[Any]:
 def _labels(name: str, value: Any, beside: dict[str, Any]) -> list[str]:
     """Texts that name the columns of a matrix.
 
-    `NAME_label`, as Mission Planner writes it, or texts beside it that are as many, as MATLAB's `importdata` gives.
+    `NAME_label`, as Mission Planner writes it, or texts next to it that are as many, as MATLAB's `importdata` gives.
     """
     if np.ndim(value) != 2:
         return []

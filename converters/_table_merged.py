@@ -126,7 +126,7 @@ def join_milliseconds(columns: Columns) -> None:
 
 
 def settle_zones(columns: Columns) -> None:
-    """Take the zone of dates that name none from a time since 1970 beside them, row by row."""
+    """Take the zone of dates that name none from a time since 1970 next to them, row by row."""
     for local in columns.local_times:
         dates = columns.values[local]
         for column, values in columns.values.items():
@@ -237,7 +237,7 @@ def _cut_held(columns: Columns, before: dict[str, str], clocks: dict[str, np.nda
             _take_rows(columns, column, rows, separate, f"{before[clock]}/{'time' if column == clock else column}")
             del spelled[column]
         separate.units[f"{before[clock]}/time"] = columns.units.get(clock) or name_and_unit(clock, "")[1]
-        columns.remarks.notes.append(f"{is_still.sum()} rows repeat the samples beside {clock!r}, which are taken once")
+        columns.remarks.notes.append(f"{is_still.sum()} rows repeat the samples at {clock!r}, which are taken once")
     for column in spelled if separate.values else ():
         group, name = before.get(finest) or finest, "time" if column == finest else column
         _take_rows(columns, column, clocks[finest], separate, f"{group}/{name}")

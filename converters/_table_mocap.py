@@ -1,6 +1,6 @@
 """Exports of motion captures: OptiTrack Motive, Vicon, Qualisys (text and .mat).
 
-Each body becomes the columns `BODY/x [mm]`, ..., `BODY/qw`, ... beside one `time [s]`. Motive and Vicon write a quaternion
+Each body becomes the columns `BODY/x [mm]`, ..., `BODY/qw`, ... next to one `time [s]`. Motive and Vicon write a quaternion
 where they are asked to; Qualisys writes a matrix, column by column.
 """
 

@@ -57,7 +57,7 @@ LENGTH_UNITS = (  # at the end of the name of a position or of a height
     r"(?:[a-z]*[xyz]|[ned]|east|north|up|down|alt(?:itude)?|height|hgt|elevation)(?:_in)?_(mm|cm|m|met(?:er|re)s?)"
 )
 G_INSIDE = r"(?<=acc_)g|(?<=accel_)g|(?<=acceleration_)g"  # else `g` is a gyro
-WITHOUT_GRAVITY = r"(user|free|lin|linear)_?acc"  # where an acceleration with gravity is beside it
+WITHOUT_GRAVITY = r"(user|free|lin|linear)_?acc"  # where an acceleration with gravity is next to it
 ESTIMATED = r"(^|_)(est|estimated|filt|filtered|smoothed|fused|rotated|world|earth|ref|reference)(_|$)"  # no sensor
 CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration` of Apple's CoreMotion
 WHOLE_WORDS = "gyr|acc|time"  # that begin behind capitals
@@ -184,7 +184,7 @@ def _plain(group: str) -> str:
 
 
 def name_and_unit(column: str, beside: str) -> tuple[str, str]:
-    """Name and unit of a column; a unit `beside` the column counts where its name has none."""
+    """Name and unit of a column; the unit `beside` the column counts where its name has none."""
     name, unit = split_name(column)
     return name, unit or unit_named(beside) or split_name(_spaced(column))[1]
 

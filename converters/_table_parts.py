@@ -1,6 +1,6 @@
 """Recordings and sensors of one file, in groups, or by columns that tell them apart.
 
-A table is several recordings where such a column (`trial`) is beside a time that goes back, or beside no time, and where its
+A table is several recordings where such a column (`trial`) meets a time that goes back, or no time, and where its
 time begins anew without such a column. Sensors (`placement`) are IMUs of one recording where they have times in common.
 Columns of one length are a table.
 """

@@ -14,7 +14,7 @@ from ._table_sensors import SENSORS, SPACED, WORD, pairs_among, plain_among, sen
 
 Names = Mapping[Path, str]  # of tables, without their endings
 IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of UZH-FPV's imu.txt; else its columns show it
-IMUS = r"(imu|inertial)[ _-]?\w{1,20}"  # of several beside one file of poses: imu_1, imu_left
+IMUS = r"(imu|inertial)[ _-]?\w{1,20}"  # of several next to one file of poses: imu_1, imu_left
 POSES = rf"(.*[ _-])?({TRUE_GROUPS}|ground[ _-]truth)([ _-].*)?"  # groundtruth.txt, stamped_groundtruth_imu.txt
 REFERENCE = r"(.*[ _-])?ref(erence)?([ _-].*)?"  # of poses; of rates it is an ideal sensor
 ROLES = "imu|inertial|ground|truth|poses?|raw|rots?|ref|reference"
@@ -28,7 +28,7 @@ def without_role(stem: str) -> str:
 
 
 def role_folders(folder: Path) -> list[Path]:
-    """Folders of IMUs, then those of poses beside them, by their names; none without both."""
+    """Folders of IMUs, then those of poses next to them, by their names; none without both."""
     folders = {path: re.sub(SPACED, "_", path.name).lower() for path in sorted(folder.iterdir()) if path.is_dir()}
     imus = [path for path, name in folders.items() if re.fullmatch(IMU, name)]
     poses = [path for path, name in folders.items() if re.fullmatch(rf"{POSES}|poses?", name) and path not in imus]

@@ -249,7 +249,7 @@ class _GyroTurns(NamedTuple):
 
 
 class _Alike(NamedTuple):
-    """Turns of poses beside the gyro's."""
+    """Turns of poses and of the gyro."""
 
     correlation: float  # under the best rotation between poses and gyro
     slope: float  # of the poses' turns by the gyro's, which noise of the poses does not bias

@@ -1,6 +1,6 @@
 """Tables of one sensor each, as files of their own or as rows that name their sensor.
 
-`Gyro.txt` beside `Accel.txt`; `1574572404895 TYPE_GYROSCOPE 0.12 0.35 0.43 3`; `ACCE;0.015;25347.8;0.1;0.2;9.8;3`.
+`Gyro.txt` next to `Accel.txt`; `1574572404895 TYPE_GYROSCOPE 0.12 0.35 0.43 3`; `ACCE;0.015;25347.8;0.1;0.2;9.8;3`.
 The columns of the gyroscope and of the accelerometer become `gyro/time`, `gyro/x`, ....
 """
 
@@ -181,7 +181,7 @@ def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
     names = [*table.values]
     if not names:
         return
-    has_header = not all(re.fullmatch(r"column \d+|time", name) for name in names)  # the time may be that of a clock beside it
+    has_header = not all(re.fullmatch(r"column \d+|time", name) for name in names)  # the time may be that of a clock next to it
     if has_header and not sensor:
         return
     if not sensor:

@@ -63,7 +63,7 @@ class Unpacked:
 def unpacked(source: Path, out: Path, known: Collection[str] = ()) -> Iterator[Unpacked]:
     """Yield the content of a packed file, or of the packed files of a folder.
 
-    It is in a temporary folder beside `out`. Packed files in packed files are unpacked, too. Of a folder, those are left that
+    It is in a temporary folder next to `out`. Packed files in packed files are unpacked, too. Of a folder, those are left that
     are `known`, or in a known folder. Errors name the source.
 
     Raises:
@@ -207,5 +207,5 @@ def _room(folder: Path) -> int:
 
 
 def _too_large(source: Path, what: str, maximum: int) -> DataError:
-    expected = f"at most {maximum}, half of the free disk beside the target"
+    expected = f"at most {maximum}, half of the free disk of the target"
     return DataError(what, where=source, expected=expected, fix="Choose an `out` on a larger disk, or unpack it there yourself")

@@ -35,7 +35,7 @@ def sequences(source: Path) -> list[Sequence]:
 
 
 def logs_in(folder: Path) -> dict[str, list[Path]]:
-    """Tables of each log of a folder; none where another table is beside them."""
+    """Tables of each log of a folder; none where another table is next to them."""
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".csv")
     names = {match["log"] for path in files if (match := re.fullmatch(SENSORS, path.name))}
     logs: dict[str, list[Path]] = {name: [] for name in sorted(names, key=len, reverse=True)}

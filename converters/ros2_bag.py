@@ -1,7 +1,7 @@
 """ROS 2 bag, sqlite3 or MCAP, split or compressed: every topic under its own name.
 
 A bag is the folder with its metadata.yaml, a folder of storage files that its recorder did not finish, or a single .db3 file.
-Bags of old ROS 2 versions hold no definitions: those of ROS 2 Jazzy stand in, then .msg files beside the bag or in the
+Bags of old ROS 2 versions hold no definitions: those of ROS 2 Jazzy stand in, then .msg files next to the bag or in the
 workspace that is sourced. A type without any keeps its bytes, and is named.
 """
 

@@ -223,7 +223,7 @@ def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
 
 
 def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: Remarks) -> dict[str, Poses]:
-    """True poses, where the map names them: in the table, or in a file beside it."""
+    """True poses, where the map names them: in the table, or in a file next to it."""
     if not (table.quaternion_wxyz or table.rotation_matrix or table.roll_pitch_yaw):
         return {}
     if table.truth_file:

@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 from mkdocs.structure.files import File, Files
 
+from imutool.cli.parameters import value_of
 from imutool.config import Settings
 
 ROOT = Path(__file__).parents[1]
@@ -34,8 +35,6 @@ SETTINGS = """# Settings
 the same keys, `--config FILE.toml`. Values are those of TOML; the shell wants quotes around lists:
 `--set 'gyro_window_s=[1, 4, 15]'`. A key that does not exist is refused, and the nearest is named.
 """
-
-PLACEHOLDERS = {"str": "TEXT", "int": "N", "float": "X", "Path": "PATH", "path": "PATH", "int range": "N"}
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -108,7 +107,7 @@ def toml(value: Any) -> str:
 
 
 def meaning_of(kind: type[Any], name: str) -> str:
-    """The comment beside a setting in the source of its class."""
+    """The comment next to a setting in the source of its class."""
     sources = (inspect.getsource(each) for each in kind.__mro__ if name in vars(each).get("__annotations__", {}))
     found = re.search(rf"^    {name}: .*?  # (.*)$", next(sources), re.MULTILINE)
     return found[1] if found else ""
@@ -146,7 +145,7 @@ def section(command: Any, name: str) -> str:
     words = [word if p.required else f"[{word}]" for p, word in zip(arguments, words, strict=True)]
     lines = [f"## {name}", "", text_of(command.help), "", "```console", f"$ {' '.join([name, '[OPTIONS]', *words])}", "```", ""]
     rows = [(f"`{p.metavar or p.name}`", help_of(p)) for p in arguments]
-    rows += [(f"`{', '.join([*p.opts, *p.secondary_opts])}{value_of(p)}`", help_of(p)) for p in options]
+    rows += [(f"`{', '.join([*p.opts, *p.secondary_opts])} {value_of(p)}".rstrip() + "`", help_of(p)) for p in options]
     lines += ["| argument or option | |", "|---|---|", *(f"| {left} | {cell(right)} |" for left, right in rows)]
     return "\n".join([*lines, "", *values_of(command), "", example_of(command), ""])
 
@@ -154,14 +153,6 @@ def section(command: Any, name: str) -> str:
 def cell(text: str) -> str:
     """Text for a table's cell."""
     return text.replace("|", "\\|").replace("\n", " ")
-
-
-def value_of(option: Any) -> str:
-    """Placeholder of an option's value; none for a flag."""
-    if option.is_flag:
-        return ""
-    shown = option.metavar or re.sub(r"[<>]|list\[|\]", "", option.display_type(None))
-    return f" {PLACEHOLDERS.get(shown.partition(' [')[0], shown)}"
 
 
 def help_of(parameter: Any) -> str:

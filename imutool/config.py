@@ -119,18 +119,18 @@ def _of_value(reason: str, where: str | Path | None, values: Any) -> ConfigError
     expected, got = "", ""
     if what.startswith("Expected "):
         expected, _, got = what.removeprefix("Expected ").partition(", got ")
-        what = f"has {got} items" if got.isdigit() else f"is {got}" if got else f"is {_at(place, values)}out of range"
+        what = f"has {got} items" if got.isdigit() else f"is {_at(place, values)}{got or 'out of range'}"
     what, expected = (re.sub(r"`([\w |]+)`", _in_words, text) for text in (what, expected))
     return ConfigError(what, where=f"{where or 'settings'}{': ' * bool(place)}{place}", expected=expected)
 
 
 def _at(place: str, values: Any) -> str:
-    """Value at a place of msgspec, with a comma; nothing where the place hides a key."""
-    if "[...]" in place:
+    """Value at a place of msgspec, with a comma; nothing where the place hides a key, or is all values."""
+    if not place or "[...]" in place:
         return ""
     for key, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", place):
         values = values[int(index) if index else key]
-    return f"{values}, "
+    return f"{values!r:.60}, "
 
 
 def _in_words(types: re.Match[str]) -> str:

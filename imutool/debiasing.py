@@ -166,7 +166,7 @@ def debias(
     log's metadata names, else the one that ships for its very sensor, else the mean at rest. The IMUs are those in `imus`, else
     those with a model of their own, else the log's only one. With `smooth` the initial bias comes from the whole log.
     Without a target the log itself is replaced; `check` is that of `mcap_io.rewrite`. The intact part of a damaged log is
-    debiased from a repaired copy beside the target (`mcap_io.repair`), and `losses` lists the rest; it is not replaced. With
+    debiased from a repaired copy next to the target (`mcap_io.repair`), and `losses` lists the rest; it is not replaced. With
     `clean` a first pass finds samples to leave out or convert (`imutool.cleaning`); the record `imutool_clean` lists them.
     The new IMU has the type and encoding of its source, or with `encoding` "cdr" those of ROS 2.
     A chunk of more than `max_chunk` bytes is not read. A model that does not fit (`fitness`) is used only with `force`.

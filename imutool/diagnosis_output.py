@@ -1,6 +1,6 @@
 """Output folder of a diagnosis: findings.json, physics.toml, report, log and view.
 
-The files are made in a folder beside it and moved when all are there, so that a reader never finds half a diagnosis. Other
+The files are made in a folder next to it and moved when all are there, so that a reader never finds half a diagnosis. Other
 files in the folder, the logs themselves for instance, stay as they are.
 """
 

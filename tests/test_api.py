@@ -172,6 +172,15 @@ def test_arrays_survive_a_log_bit_for_bit(tmp_path: Path) -> None:
     assert imutool.read(tmp_path / "a.mcap") == recording
 
 
+@pytest.mark.parametrize("other_poses", [{}, {"/slam/pose": "odometry"}])
+def test_poses_keep_their_kind_whatever_their_topic_is_called(tmp_path: Path, other_poses: dict[str, str]) -> None:
+    made = imutool.example_recording(3, duration_s=2.0)
+    recording = replace(made, truths={"/slam/pose": made.truth}, other_poses=other_poses)
+    imutool.write(tmp_path / "a.mcap", recording)
+    assert imutool.read(tmp_path / "a.mcap", truth="/slam/pose" if other_poses else None) == recording
+    assert dict(imutool.read(tmp_path / "a.mcap").other_poses) == other_poses
+
+
 def test_a_recording_is_debiased_as_its_log_is(tmp_path: Path, logs: Path) -> None:
     source, model = logs / "flight_2.mcap", logs / "linear.safetensors"
     from_arrays = imutool.debias(imutool.read(source), imutool.load_model(model))
@@ -277,7 +286,7 @@ ZEROS = np.zeros((2, len(STILL.imu), 3))
         (lambda: imutool.clean("a.mcap", rules=[3]), "rules: is of type list; expected text or a list of texts"),
         (
             lambda: imutool.train("a.mcap", "m.safetensors", settings={"seed": "x"}),
-            "settings: seed: is text; expected an integer",
+            "settings: seed: is 'x', text; expected an integer",
         ),
         (
             lambda: imutool.train("a.mcap", "m.safetensors", settings={"steps": -1}),

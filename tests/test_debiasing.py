@@ -76,7 +76,7 @@ def make_model(method: str, rate_hz: float = RATE_HZ) -> BiasModel:
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
-    """A flight of several chunks, with images, scalars and metadata beside it; it starts at rest."""
+    """A flight of several chunks, with images, scalars and metadata next to it; it starts at rest."""
     made = flight(1, duration_s=20.0)
     return Recording(
         made.name,
@@ -149,7 +149,7 @@ def metadata(path: Path) -> list[tuple[str, dict[str, str]]]:
 
 @pytest.fixture
 def target(files: Path, source: Path, model_file: Path, tmp_path: Path) -> Path:
-    """What the model made of the log; both lie beside it."""
+    """What the model made of the log; both lie next to it."""
     return Path(shutil.copy(files / "out.mcap", tmp_path))
 
 

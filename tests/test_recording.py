@@ -164,11 +164,12 @@ def test_wrong_shapes_and_types_are_refused_without_the_type_checker_too(
         (T.astype(np.uint64), V.astype(np.float32)),
         (T.astype(">i8"), V.astype(">f8")),
         (T.astype("datetime64[ns]"), V.astype(np.int16)),
+        (T.astype("timedelta64[ns]"), V),
         (T, np.ma.masked_greater(V, 99.0)),
         (T.astype(object), V.astype(object)),
         (T, torch.from_numpy(V.copy())),
     ],
-    ids=["lists", "smaller", "byte order", "dates", "nothing masked", "objects", "tensor"],
+    ids=["lists", "smaller", "byte order", "dates", "durations", "nothing masked", "objects", "tensor"],
 )
 def test_what_converts_without_loss_is_taken(t_ns: Any, gyro: Any) -> None:
     assert unchecked(Imu, t_ns, gyro, V) == Imu(T, V, V)

@@ -148,7 +148,7 @@ def load(path: Path) -> BiasModel:
 
 
 def library() -> Path:
-    """Folder of the shipped models: inside the installed package, or beside it in a checkout."""
+    """Folder of the shipped models: inside the installed package, or next to it in a checkout."""
     inside = Path(__file__).parents[1] / "_models"
     return inside if inside.is_dir() else Path(__file__).parents[2] / "models"
 
@@ -165,7 +165,7 @@ def find_model(name: str | Path, rate_hz: float | None = None) -> BiasModel:
     path = model_file(name)
     if path.suffix.lower() == ".toml":
         if rate_hz is None:
-            raise ModelError("a physics.toml has no sample rate", where=path, expected="`rate_hz`")
+            raise ModelError("a physics.toml has no sample rate", where=path, expected="`rate_hz`, or a trained model")
         from imutool.bias import physics
 
         with suppress(OSError):  # the reader reports it

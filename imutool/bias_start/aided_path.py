@@ -55,7 +55,7 @@ class AidSettings(Settings, frozen=True, kw_only=True):
     mount_rad: Positive = 0.03  # least error of a mount that the log shows
     levelled_rad: Positive = 0.1  # of an IMU whose x is taken for forward
     scale: Positive = 0.03
-    height_m: Positive = 0.1  # beside the barometer's own white noise
+    height_m: Positive = 0.1  # without the barometer's own white noise
     height_walk_m: Positive = 0.05  # per second^1/2
     height_window_s: Positive = 0.5
     rate_window_s: Positive = 0.1

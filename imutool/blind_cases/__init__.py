@@ -135,7 +135,7 @@ def case_log(imu: Imu, truth: Poses, channels: Mapping[str, Scalars]) -> Recordi
 
 
 def write_case(folder: Path, sim: Recording, real: Recording, truth: ConcealedTruth) -> None:
-    """Seals a case: writes all files beside the folder, then moves each into its place.
+    """Seals a case: writes all files next to the folder, then moves each into its place.
 
     The envelope is moved last.
 
@@ -245,4 +245,4 @@ def _grade(noise: str | Path, rng: Generator) -> tuple[str, Noise]:
 
 def _check(name: str, value: str, known: Sequence[str]) -> None:
     if value not in known:
-        raise ConfigError(f"`{name}` is {value!r}", where=name, expected=f"one of {', '.join(known)}")
+        raise ConfigError(f"unknown {name} {value!r}", where=name, expected=f"one of {', '.join(known)}")

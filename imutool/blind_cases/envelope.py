@@ -1,7 +1,7 @@
 """Envelope with the concealed truth of a blind case: a seal, not security.
 
 The truth is JSON, padded to a multiple of 16 KiB so that its length reveals nothing, XORed with SHAKE-256 of a random key in a
-file beside it. The commitment, a SHA-256 over a random salt, the truth and the logs, shows whether any of them was changed.
+file next to it. The commitment, a SHA-256 over a random salt, the truth and the logs, shows whether any of them was changed.
 Whoever has the folder can open the envelope at once; nobody can change it unnoticed, nor read it by accident.
 """
 

@@ -97,7 +97,7 @@ def distinct(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
 def bunched(steps_ns: Int64[np.ndarray, " n"]) -> tuple[int, int]:
     """Numbers of steps within a batch, and of all steps that say anything of the period.
 
-    A step is short beside those near it: a logger may go on at a tenth of its rate.
+    A step is short in comparison with those near it: a logger may go on at a tenth of its rate.
     """
     near = steps_ns[(steps_ns >= 0) & (steps_ns < GAP_NS)]
     parts = np.array_split(near, max(1, round(len(near) / WINDOW))) if len(near) else []

@@ -1,4 +1,4 @@
-"""Sizes that settle units: gravity as accel reads it, the gyro's rate beside the true one."""
+"""Sizes that settle units: gravity as accel reads it, and the gyro's rate over the true one."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ def _command(example: str) -> Callable[[Callable[..., Settings]], Callable[..., 
 @_command("debias logs/ clean/ --model euroc-adis16448-hybrid --report clean.html")
 def debias(
     model: Annotated[
-        str | None, typer.Option(help="Model file or a name that ships; by default from the log's metadata.")
+        str | None, typer.Option(help="Model file, physics.toml or a name that ships; by default from the log's metadata.")
     ] = None,
     init: Init = "auto",
     smooth: Smooth = False,

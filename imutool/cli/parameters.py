@@ -48,6 +48,7 @@ TAUGHT_ELSEWHERE = (
     (("--topic",), ("--imu",)),
     (("--jobs", "-j"), ("--workers",)),
 )
+VALUES = {"imu": "TOPIC", "truth": "TOPIC", "int": "N", "int range": "N", "float range": "NUMBER", "path": "FILE"}
 FOLDERS = "imutool.folder."  # begins the key in a context of whether a parameter's word ends in a slash
 LIKE = 0.75  # of a misspelt option to the one that is meant, by difflib
 current: ContextVar[Mapping[str, str]] = ContextVar("flags of the command that runs", default={})  # noqa: B039  never changed
@@ -67,6 +68,15 @@ def flags(command: Any) -> dict[str, str]:
         if flag is not None:
             flag_of.setdefault(name, flag)
     return flag_of
+
+
+def value_of(parameter: Any) -> str:
+    """Word for the value of an option in a help; empty for a flag and for an argument."""
+    if parameter.param_type_name == "argument" or parameter.is_flag:
+        return ""
+    kind = parameter.display_type(None).strip("<>").removeprefix("list[").removesuffix("]")
+    own = parameter.name.strip("_").upper() if kind == "str" else kind
+    return str(parameter.metavar or VALUES.get(parameter.name if kind == "str" else kind, own))
 
 
 def instead_of(option: str, command: Any) -> list[str]:
@@ -157,6 +167,8 @@ class PlainValue:
     @staticmethod
     def into(parameter: Any) -> Any:
         """The parameter with this conversion, where typer converts values this way."""
+        if getattr(parameter, "display_type", None):  # in the help: Typer's own names Python's types, also of a flag
+            parameter.display_type_rich = lambda ctx: value_of(parameter)
         otherwise, described = getattr(parameter, "get_runtime_param", None), getattr(parameter, "type_descriptor", None)
         if otherwise is not None and described is not None and not isinstance(otherwise, partial):
             parameter.get_runtime_param = partial(PlainValue, described.annotation, otherwise)

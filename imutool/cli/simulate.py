@@ -138,8 +138,8 @@ def conceal(
     """
     log_to_stderr(verbose, quiet)
     if len(places) != (1 if open_it else 2):
-        expected = "DIR alone" if open_it else "TRAJECTORY and DIR"
-        raise ConfigError(f"{len(places)} places are named", where="conceal", expected=expected)
+        given = " ".join(map(str, places))
+        raise ConfigError(f"{given!r} is given", where="conceal", expected="DIR alone" if open_it else "TRAJECTORY and DIR")
     made = {"--seed": seed is not None, "--kind": kind != "any", "--size": size != "any", "--noise": noise != "any"}
     made |= {"--longest": longest != LONGEST_S, "--truth": truth is not None}
     if open_it and (idle := [name for name, given in made.items() if given]):

@@ -112,7 +112,7 @@ class _Stream:
         self._reflected: dict[int, tuple[int, Reflected | Px4]] = {}  # channel of the CDR, by that of the original
         self._has_imu = any(schemas.canonical(topic.schema_name) == schemas.IMU for topic in source.topics)
         self._begun = set[int]()  # channels that have messages
-        self._made_of = set[str]()  # topics of PX4 beside which another is made
+        self._made_of = set[str]()  # topics of PX4 from which another is made
         self.paths = Paths()
         self._lacking = Counter[str]()  # messages without a sample, by topic
         self.counts = Counter[str]()

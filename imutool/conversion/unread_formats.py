@@ -63,7 +63,7 @@ FORMATS = {  # what a file that begins like this is, and what to do
     ),
     rb"[\x02-\x05]P": (
         "it is a C3D file of a motion capture",
-        "Export it as CSV or TRC, and convert it beside the table of the IMU",
+        "Export it as CSV or TRC, and convert it together with the table of the IMU",
     ),
     rb"\x80[\x02-\x05].*[()}\].]": (
         "it is a pickle of Python, which can run any program when it is read",

@@ -97,7 +97,7 @@ def remarks(findings: Sequence[Finding], sim_findings: Sequence[Finding]) -> Ite
 def contradictions(logs: Sequence[WhitenedLog], selection: Selection) -> Iterator[str]:
     """Remarks on recordings whose own numbers of the findings are not those of the others.
 
-    Numbers in which units and mounts differ are fitted beside the findings: what only some recordings have is not among these.
+    Numbers in which units and mounts differ are fitted with the findings: what only some recordings have is not among these.
     """
     found, always = selection.whole, selection.always
     beside = [
@@ -151,7 +151,7 @@ def _squares(found: Fit, logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, " k
 
 
 def _differing(own: Fit, others: Fit, found: Fit) -> str:
-    """The effect whose own numbers explain most beside those of the others, and both numbers, fitted beside the findings."""
+    """The effect whose own numbers differ most from those of the others, and both, fitted with the findings."""
     theta, pull = dict(zip(others.keys, others.chosen, strict=True)), np.zeros(len(own.information))
     for effect, own_theta in own.chosen:
         other_values = values_of(theta[effect.key][0], effect, theta[effect.key][1])

@@ -115,7 +115,7 @@ def unexplained_residuals(
         if not white and beside_poses:
             p_value = _p_value(logs, after, part, noise, settings)
             white = p_value > settings.white_p_value and held_out.rms_after < settings.max_white_ratio * noise
-        minimum = held_out.rms_after or noise  # no noise is larger: it was measured beside what the findings explain
+        minimum = held_out.rms_after or noise  # no noise is larger: it was measured without what the findings explain
         out[signal] = Unexplained(held_out.rms_after, min(noise, minimum), white, p_value)
     return out
 

@@ -53,7 +53,7 @@ def locate_residual(
 ) -> list[Located]:
     """Locations of unexplained residuals: running means beyond those of calm seconds, or all.
 
-    `p_values` are those of white noise, by signal. Beside an exact simulation the samples count where they hold far more than
+    `p_values` are those of white noise, by signal. Against an exact simulation the samples count where they hold far more than
     the means, which lose a vibration. Poses show no such motion.
     """
     residuals = [pair.real - a for pair, a in zip(pairs, after, strict=True)]

@@ -72,7 +72,7 @@ def along_samples(
 ) -> Simulation:
     """Simulation whose samples, without their white noise, are the ideal signals of a sensor.
 
-    A recording `beside` it, of the same motion, tells more of the samples' noise, and has the channels.
+    The recording `beside`, of the same motion, shows more of the samples' noise, and has the channels.
 
     Raises:
         ConfigError, LogError: the log cannot be read, or has no such IMU.

@@ -65,7 +65,7 @@ class NoiseSettings(Settings, frozen=True):
     walk_cycles: Positive = 0.1  # of a log in the slowest walk that is looked for: at its corner both noises have one density
     walk_hz: Positive = 0.5  # corner of the fastest one: the accelerometer of EuRoC's sensor.yaml has 0.25 Hz
     walk_corners: Count = 14  # tried between these
-    walk_fastest_hz: Positive = 8.0  # beside what depends on time alone; faster is whiter than half-second means show
+    walk_fastest_hz: Positive = 8.0  # if not all depends on time alone; faster is whiter than half-second means show
     walk_fast_corners: Count = 4  # tried above the former
 
     def segment_of(self, samples: int) -> int:

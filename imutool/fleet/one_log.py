@@ -171,7 +171,7 @@ def _imus(job: _Job) -> tuple[str, ...]:
 
 
 def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[str, Any]:
-    """Write a page beside a debiased log; on failure the result has a warning."""
+    """Write a page next to a debiased log; on failure the result has a warning."""
     from imutool.viewing.html import report
     from imutool.viewing.html.page import is_imutool_page
     from imutool.viewing.html.report_wording import conclusion

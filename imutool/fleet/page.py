@@ -269,7 +269,7 @@ def _provenance(settings: Settings) -> Iterator[str]:
         entries |= {"unfit models": "used" if settings.force else "refused"}
         entries["verified"] = f"structure, and contents: {settings.check}"
     if settings.command == "diagnose":
-        entries |= {"robots": settings.robot_from or "by folder", "beside": settings.sim or "the true poses"}
+        entries |= {"robots": settings.robot_from or "by folder", "compared with": settings.sim or "the true poses"}
     entries |= {"IMU": ", ".join(settings.imus), "truth": settings.truth or ""}
     for name, value in entries.items():
         if value and (settings.command == "debias" or not name.startswith("model")):

@@ -100,13 +100,13 @@ def find(text: str, out: Location, *, bags: bool = False, once: bool = False) ->
             refused.append((shown(where), str(error)))
     if not logs and not refused and outputs:
         what = f"its {outputs} logs lie below OUT ({redact(str(out))}), where outputs are and no sources"
-        raise ConfigError(what, where=text, fix="Choose an OUT beside the logs")
+        raise ConfigError(what, where=text, fix="Choose an OUT outside the folder of the logs")
     if not logs and not refused:
         expected = "a log, a folder with logs, or a pattern that fits some"
         raise ConfigError(f"no {' or '.join(endings)} log", where=text, expected=expected, fix=CONVERT if passed_over else "")
     if outputs and not exists(out / JOURNAL):  # they are no results of a fleet
         redacted = redact(text), outputs, redact(str(out))
-        logger.warning("%s: of its logs %d are left out, for they lie below OUT (%s); choose an OUT beside the logs", *redacted)
+        logger.warning("%s: of its logs %d are left out, for they lie below OUT (%s); choose an OUT outside of it", *redacted)
     if passed_over:
         kinds = ", ".join(f"{count} {ending}" for ending, count in passed_over.items())
         logger.warning("%s: files that are no MCAP logs are passed over (%s); %s", redact(text), kinds, CONVERT)

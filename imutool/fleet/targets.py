@@ -15,7 +15,7 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough import source_digest
 from imutool.mcap_io.storage.source import sha256
 
-LONGEST = 200  # bytes of one part of a name: room for what is written beside it under another, within the usual 255
+LONGEST = 200  # bytes of one part of a name: room for what is written next to it under another, within the usual 255
 PARTIAL = re.compile(r"\.(?P<name>.+)\.\d+\.[0-9a-f]{8,24}\.partial", re.DOTALL)
 LARGEST_HASHED = 4 << 20  # bytes of a log: SHA-256 takes two milliseconds for so many, a digest with CRCs a tenth of one
 OWN = "fleet."  # how the names of what the fleet itself writes at the top of OUT begin
@@ -133,7 +133,7 @@ def is_current(done: Result, target: Location, *, whole: bool = False) -> bool:
 
 
 def partial_files(out: Location, names: Iterable[str]) -> Iterator[Location]:
-    """Partial files that killed runs left beside these targets: .NAME.PID.RANDOM.partial."""
+    """Partial files that killed runs left next to these targets: .NAME.PID.RANDOM.partial."""
     folders: dict[str, set[str]] = {}
     for name in names:
         folder, _, file = name.rpartition("/")

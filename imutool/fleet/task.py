@@ -31,7 +31,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     smooth: bool = False
     force: bool = False  # debias: use a model although it does not fit the log
     clean: bool = True
-    pages: bool = False  # debias: a page about each log beside it
+    pages: bool = False  # debias: a page about each log next to it
     check: str = "imu"  # what of a new log is read back: all, imu or none
     damaged: str = "drop"
     sim: str | None = None

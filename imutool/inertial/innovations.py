@@ -17,7 +17,7 @@ SURPRISING = 7.81  # chi-square of three that one innovation in twenty exceeds: 
 LAGS = 6  # blocks over which innovations depend on each other: the bounded velocity is no white noise
 MIN_DRIVEN_M_S, DRIVEN = 0.5, 11.3  # speed, and its chi-square, which a body at rest exceeds once in a hundred times
 DRIVEN_M_S = 2.0  # speed that is no error of the filter
-TURNS = 25.0  # chi-square of a rate beside the bias so far, which no vibration makes
+TURNS = 25.0  # chi-square of a rate against the bias so far, which no vibration makes
 
 
 class Innovations(NamedTuple):
@@ -48,7 +48,7 @@ def innovations(steps: Iterable[Step]) -> Innovations:
 class DriveDetector:
     """Detector of steady drives among blocks that look like rest.
 
-    A body that drives shakes more than at a stop before, and by the filter has speed, or a rate beside the bias so far. An
+    A body that drives shakes more than at a stop before, and by the filter has speed, or a rate other than the bias so far. An
     engine hides that this rate is not constant.
     """
 

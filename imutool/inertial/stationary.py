@@ -62,7 +62,7 @@ class StationarySettings(Settings, frozen=True, kw_only=True):
     gyro_mean_rad_s: Positive = 0.2  # about gravity; a larger mean is a turn, not a bias (11 degrees a second)
     gyro_bias_rad_s: Positive = 0.7  # about any axis; ITG-3200 40 degrees a second
     gyro_agreement_rad_s: Positive = 0.02  # between a window's mean and the rate at rest
-    gyro_trend_rad_s: Positive = 2e-3  # between the means of a window's halves, beside four deviations of their noise
+    gyro_trend_rad_s: Positive = 2e-3  # between the means of a window's halves, in addition to four deviations of their noise
 
 
 class Blocks(NamedTuple):

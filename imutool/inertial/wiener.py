@@ -153,7 +153,7 @@ def _drift_s(
 ) -> Float64[np.ndarray, " n"]:
     """Line of time to add to recorded stamps.
 
-    With it slow rates agree beside any linear map of them (Gauss-Newton). Nothing if that changes less than a period, or
+    With it slow rates agree up to any linear map of them (Gauss-Newton). Nothing if that changes less than a period, or
     explains no more.
     """
     inside = (t_s >= own_s[0]) & (t_s <= own_s[-1])
@@ -195,7 +195,7 @@ def _noise_std(
             out[:, k] = np.interp(np.arange(len(out)), own, level)
         elif column.mean() > ALMOST_ALL or not white:
             out[:, k], unknown[k] = NO_NOISE * power[:, k].max(), white
-        if white and beyond_chance and not unknown[k]:  # beside a vibration that is not shared it would be too much
+        if white and beyond_chance and not unknown[k]:  # with a vibration that is not shared it would be too much
             maximum = unexplained * uniform_filter1d(power[:, k], settings.short_time_parts, mode="nearest")
             out[column, k] = np.clip(maximum[column], NO_NOISE * power[:, k].max(), out[column, k])
     return np.asarray(np.sqrt(np.maximum(out, 1e-300))), unknown

@@ -1,6 +1,6 @@
 """Aids of an IMU in a log: its barometer, and what is wrong with that.
 
-A barometer is a `FluidPressure`, or a number that is named as a pressure or an altitude. Beside true poses its height must rise
+A barometer is a `FluidPressure`, or a number that is named as a pressure or an altitude. With true poses its height must rise
 as they do. Wheel odometry is that of `wheel_odometry`. The truth, an estimate and a command are never an aid.
 """
 

@@ -31,10 +31,10 @@ from imutool.mcap_io.write import own_and_user_metadata
 from imutool.processes.system import release_memory
 from imutool.recording import UNIT_QUATERNION_TOLERANCE, Imu, Poses, Recording, Scalars, unit_quaternions
 from imutool.recording.columns import ClockRun, clock_jumps, clock_runs, jump_warnings
+from imutool.recording.message_log import DOUBTFUL
 
 logger = logging.getLogger(__name__)
 
-DOUBTFUL = ("estimate", "odometry")  # kinds of poses
 RELEASED_BYTES = 1 << 20  # parts of a column this large leave memory that is worth its release
 
 

@@ -277,7 +277,7 @@ def _attach_damaged(out: LogWriter, source: Source, loss: Loss) -> None:
 
 @contextmanager
 def repaired(source: Location, beside: Location, max_chunk: int | None) -> Iterator[tuple[Location, Losses] | None]:
-    """Temporary repaired copy of a damaged log beside another file; None if the log is intact.
+    """Temporary repaired copy of a damaged log next to another file; None if the log is intact.
 
     Raises:
         ConfigError: the copy cannot be written.

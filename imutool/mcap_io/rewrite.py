@@ -4,7 +4,7 @@ A chunk without IMU messages is copied from file to file (`target.Target.copy`),
 the summary. A chunk that holds messages of a source IMU, or that its indexes do not describe, is unpacked and checked, once:
 those that were checked before the copy began (`Log.keep`) are only copied. Only the summary is new, and message indexes where
 the source has none or wrong ones. Messages outside chunks keep their bytes and are wrapped into chunks, because a reader that
-goes by chunk indexes would otherwise not find them beside the new ones.
+goes by chunk indexes would otherwise not find them next to the new ones.
 
 Where the source states the CRC of its data section, it is checked and the copy states one, for which every byte passes through
 memory (1.3 instead of 1.2 of the CPU time of `cp`, `pass` in `tests/bench/rewrite.py`). Where the source states none, as most

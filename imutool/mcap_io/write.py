@@ -23,8 +23,9 @@ from imutool.file_location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
 from imutool.mcap_io.file_writer import Chunk, LogWriter
-from imutool.mcap_io.topics import UNIT_KEY, VELOCITY_KEY
+from imutool.mcap_io.topics import KIND_KEY, UNIT_KEY, VELOCITY_KEY
 from imutool.recording import Frames, Poses, Recording, Scalars
+from imutool.recording.message_log import DOUBTFUL, named_kind
 
 CHUNK_BYTES = 1 << 20  # compression gains nothing beyond, memory grows tenfold by 32 MiB (mcap#1658)
 RECORD = "imutool"  # name of our metadata record
@@ -96,7 +97,9 @@ def _poses(log: LogWriter, recording: Recording) -> list[Series]:
     found: list[Series] = []
     for which, (topic, poses) in enumerate(recording.truths.items()):
         t_ns, columns = poses.t_ns, (poses.t_ns, poses.p_wb, poses.q_wb_wxyz)
-        channel = log.channel(topic, schemas.POSE)
+        kind, named = recording.kind_of(topic), named_kind(topic, schemas.POSE)
+        doubtful = kind != named and not {kind, named}.isdisjoint(DOUBTFUL)  # by its name it would be read as another kind
+        channel = log.channel(topic, schemas.POSE, {KIND_KEY: kind} if doubtful else {})
         found.append(Series(channel, t_ns, columns, partial(encode_pose, frame_id=WORLD)))
         if which == 0:
             encode = partial(encode_transform, frame_id=WORLD, child_frame_id=BODY)

@@ -1,4 +1,4 @@
-"""Random walk of a bias beside white noise: its likelihood from means of a residual.
+"""Random walk of a bias in white noise: its likelihood from means of a residual.
 
 Every gyro and accelerometer walks (rate random walk: IEEE 952, 1293). The walk is slow, and so is a drift, or what follows a
 temperature: an effect that is weighed against white noise alone explains the walk.
@@ -21,8 +21,8 @@ Steps = Float64[np.ndarray, " w"]
 class WalkLikelihood(NamedTuple):
     """Likelihood of sizes of a walk: squares left, logarithms of determinants.
 
-    The determinants are those beside all parameters, and beside a constant alone. `fitted` are the squares of the residual as
-    it was fitted, beside the best constant, and `within` is the variance of its samples about the means of their blocks.
+    The determinants are those with all parameters, and with a constant alone. `fitted` are the squares of the residual as
+    it was fitted, with the best constant, and `within` is the variance of its samples about the means of their blocks.
     """
 
     squares: Steps

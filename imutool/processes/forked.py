@@ -33,7 +33,7 @@ IDLE = 10  # by how much an idle process is nicer than this one
 
 
 class _Processes:
-    allowed = 0  # beside this one
+    allowed = 0  # in addition to this one
     running: ClassVar[list[Forked[Any]]] = []
 
 
@@ -52,7 +52,7 @@ def forking() -> Iterator[None]:
 
 
 class Forked(Generic[T]):
-    """Result of a function that runs beside this process if a processor is free.
+    """Result of a function that runs in another process if a processor is free.
 
     What the function returns is pickled. Where it raises, it runs again in `result`, which raises the same. An `idle` one is
     for what is needed late: it runs on the time that the others leave, and takes no processor from them.

@@ -228,7 +228,7 @@ class Recording:
     def no_truth(self, what: str, expected: str = "a pose topic in the log") -> DataError:
         """Error of a recording without truth; it lists the poses that are an estimate or odometry."""
         if not self.other_poses:
-            return DataError(what, where=self.name, expected=expected)
+            return DataError(what, where=self.name, expected=expected, fix="Convert the IMU together with its true poses")
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in self.other_poses.items())
         return DataError(
             f"{what}: the poses are {listed}",

@@ -134,7 +134,8 @@ def _same(a: object, b: object) -> bool:
 def converted(value: Any, where: str, *, times: bool = False) -> Shaped[np.ndarray, "..."]:
     """Array of float64, or of int64 nanoseconds for `times`, if the value converts without loss.
 
-    A list, a table's column, numbers as objects, float32, another byte order, smaller integers, and `datetime64` for times.
+    A list, a table's column, numbers as objects, float32, another byte order, smaller integers, and for times `datetime64` and
+    `timedelta64`.
 
     Raises:
         DataError: it does not: seconds as float, masked values, text, larger integers, or nothing.
@@ -156,7 +157,7 @@ def converted(value: Any, where: str, *, times: bool = False) -> Shaped[np.ndarr
     if times and array.dtype.kind == "f":
         fix = "Convert seconds with np.round(1e9 * seconds).astype(np.int64)"
     elif times and array.dtype == object and getattr(array.flat[0], "tzinfo", None) is not None:
-        fix = "Take the time zone off with `tz_convert(None)`"
+        fix = "Take the time zone off: `column.dt.tz_convert(None)`"
     what = f"{where} is {kind}{' with masked values' * masked}"
     raise DataError(what, expected=f"{wanted}[n{'' if times else ', ...'}]", fix=fix)
 
@@ -164,9 +165,9 @@ def converted(value: Any, where: str, *, times: bool = False) -> Shaped[np.ndarr
 def _exactly(array: Shaped[np.ndarray, "..."], wanted: np.dtype[Any]) -> Shaped[np.ndarray, "..."] | None:
     """The array in another type; None where this loses something."""
     kind, times = array.dtype.kind, wanted.kind == "i"
-    if times and kind == "M":
+    if times and kind in "Mm":
         with suppress(OverflowError):  # of numpy from 2.5 on; before, other numbers stand there
-            ns = array.astype("datetime64[ns]")
+            ns = array.astype(f"{kind}8[ns]")
             return ns.astype(wanted) if not np.isnat(array).any() and np.array_equal(ns.astype(array.dtype), array) else None
         return None
     if array.size and kind in "iu" and kind != wanted.kind:

@@ -24,6 +24,7 @@ KIND_WORDS = {  # in the names of topics
     "odometry": "odom|odometry|wheel|wheels|encoder|encoders",
 }
 
+DOUBTFUL = ("estimate", "odometry")  # kinds of poses that no command uses unasked
 ESTIMATED = r"PoseWithCovarianceStamped$|TFMessage$|FrameTransforms?$"  # a filter states its covariance, or moves the frames
 
 

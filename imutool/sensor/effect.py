@@ -30,7 +30,7 @@ from imutool.sensor.signals import Signals
 from imutool.units import AXES, Three
 
 Kind = Literal["catalogue", "driven", "unknown"]
-ONCE_MORE = ("second", "third")  # variants of an effect that acts several times, each beside the one before
+ONCE_MORE = ("second", "third")  # variants of an effect that acts several times, each in addition to the one before
 Theta = Float64[np.ndarray, "_"]  # effects that act together have parameters of their own, so this length binds no other
 
 

@@ -21,7 +21,7 @@ from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.signals import COUNT, LOAD, Signals
 from imutool.units import Sensor, Three
 
-# Size of the parameters with which `forward` is asked for an error: beside that error the reading is lost in rounding, and to
+# Size of the parameters with which `forward` is asked for an error: next to that error the reading is lost in rounding, and to
 # divide by a power of two is exact. So the error has all its digits, and not only those that a reading leaves to it.
 SCALE = 2.0**100
 PROBE_ROWS, TERM_ROWS = 128, 20_000

@@ -3,7 +3,7 @@
 Poses become a smooth motion (`trajectory`), the motion ideal signals, the effects act on these in the order of their stages
 (`effect`). Noise is added behind the sensor and before its converter; the log holds the samples and the truth.
 White noise has standard deviation density * sqrt(rate), the bias walks by walk * sqrt(dt) a sample from zero (IEEE 952);
-the instability of a data sheet, a floor of the Allan deviation, is not simulated beside a walk. A noise with a colour has
+the instability of a data sheet, a floor of the Allan deviation, is not simulated with a walk. A noise with a colour has
 that spectrum at its own rate, and follows the motion as it did when it was recorded.
 """
 

@@ -20,7 +20,7 @@ FORMAT = "imutool.training/3"
 
 
 def save(training: Training, path: Path) -> None:
-    """Everything the next step depends on, written beside and renamed.
+    """Everything the next step depends on, written next to it and renamed.
 
     Raises:
         ConfigError: the file cannot be written.

@@ -1,6 +1,6 @@
 """Gradient descent from a closed form: first the gyro, then the accelerometer.
 
-What a step descends on is the objective's to say (`imutool.training.objectives`), and it mixes all logs. Beside the sensor's
+What a step descends on is the objective's to say (`imutool.training.objectives`), and it mixes all logs. Next to the sensor's
 weights each log has a slow track of its own rest bias, so that what belongs to a run cannot be mistaken for the sensor's. What
 is kept is the running mean over the last steps; or the closed form, if that drifts less over the longest windows of the
 held-out part, or if the bias of a log runs away within an hour. A choice among many steps would be made by the noise of that

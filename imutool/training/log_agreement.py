@@ -102,7 +102,7 @@ def _smoothing(pool: Pool, log: int) -> tuple[float, float]:
     """Time over which a log's poses are means, and the share of half a second's turn that this hides.
 
     The share is zero where it is not clear. Means over T miss the share T^2 / 24 of the second derivative of the attitude: the
-    residual of a window is that share of w'_end - R^T w'_start, beside scale, misalignment, bias, mount and a clock that is off
+    residual of a window is that share of w'_end - R^T w'_start, with scale, misalignment, bias, mount and a clock that is off
     by tau, whose square counts alike.
     """
     n, h = pool.samples(SMOOTHED_S), pool.samples(SLOPE_S)

@@ -74,7 +74,7 @@ def train(
         NumericsError: the loss diverged.
     """
     if is_stream(out):
-        raise ConfigError("is a pipe or a device", where=out, expected="a file, beside which the checkpoint lies")
+        raise ConfigError("is a pipe or a device", where=out, expected="a file, next to which the checkpoint lies")
     if out.exists() and not overwrite:
         raise ConfigError("exists already", where=out, fix="Choose another name or give `overwrite`")
     if not out.parent.is_dir():

@@ -77,7 +77,7 @@ class SensorPrior(Settings, frozen=True):
     """Prior over sensors: standard deviations of an effect's parameters, about zero.
 
     From data sheets: MPU-6050 (PS-MPU-6000A 3.4) for consumer sensors, ADIS16448 for industrial ones. What they were judged by
-    is in docs/measurements/a-minute.md. Units stand beside each. An effect that is not named here has its plausible size.
+    is in docs/measurements/a-minute.md. Comments state units. An effect that is not named here has its plausible size.
     """
 
     gyro_scale: Positive = 0.05  # -: MPU-6050 ±3 %; a choice, wider because TUM-VI's BMI160 has 10 %
@@ -113,7 +113,7 @@ class TrainSettings(Settings, frozen=True):
     gyro_rate: Positive = 1e-2  # learning rate of the gyro's descent
     accel_rate: Positive = 3e-3  # the same for the accelerometer
     weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-4  # of AdamW
-    track_knot_s: Positive = 20.0  # between knots of each log's own slow bias, which the training estimates beside the weights
+    track_knot_s: Positive = 20.0  # between knots of each log's own slow bias, which the training estimates with the weights
     validate_every: Count = 100  # steps between two lines of progress, each with a checkpoint
     max_samples: Count = 1_000_000  # of all logs together, each from its start: one takes 3 kB of memory
     compare: bool = True  # linear and hybrid: score left-out logs, and keep the simplest model that is not beaten

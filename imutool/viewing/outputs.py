@@ -208,8 +208,8 @@ def _check_extras(asked: RequestedOutputs) -> None:
     if asked.png is not None:
         require_matplotlib()
     if asked.opens_viewer and find_spec("rerun") is None and find_spec("matplotlib") is None:
-        expected = "the viewer, or matplotlib for a page"
-        raise ConfigError(NO_VIEWER, where="view", expected=expected, fix="pip install 'imutool[view,report]'")
+        what = "neither the viewer nor matplotlib for a page is installed"
+        raise ConfigError(what, where="view", fix="Install them with: pip install 'imutool[view,report]'")
 
 
 def _check_contradictions(asked: RequestedOutputs) -> None:

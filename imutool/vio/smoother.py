@@ -74,7 +74,7 @@ def load() -> Any:
     Raises:
         ConfigError: it is not.
     """
-    return required("gtsam", "vio", package="GTSAM", where="imutool vio")
+    return required("gtsam", "vio", package="GTSAM", where="vio")
 
 
 def estimate(

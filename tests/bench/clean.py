@@ -6,9 +6,9 @@ FETCH.
 
 `python tests/bench/clean.py [--minutes 10 60]` measures the cost.
 
-For each length: CPU seconds of `imutool.cleaning.look`, beside a pass that only reads and decodes the same IMU messages, and
-beside `imutool.log_info.inspection.inspect`, which reads the IMU several times; each in a process of its own, with the memory
-it takes at most beyond what the imports take. The log is in the page cache. Poses stand beside the IMU at 20 Hz.
+For each length: CPU seconds of `imutool.cleaning.look`, next to a pass that only reads and decodes the same IMU messages, and
+next to `imutool.log_info.inspection.inspect`, which reads the IMU several times; each in a process of its own, with the memory
+it takes at most beyond what the imports take. The log is in the page cache. Poses stand next to the IMU at 20 Hz.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ chi-square's. The coverage is the share of windows within the ellipsoids that sh
 `--left-out` each log is judged by the closed form of all others. `--made-up` draws sensors, each with its own size of errors
 and noise, learns each from `TRAINING` logs of one switching-on, and judges it by the exact poses of `TESTS` logs of others:
 here the poses have no error, and there are windows enough to see a few points. V1_01 is compared with its recomputed truth.
-With `--factor` a second coverage stands beside the first: each log's covariance of the bias times a factor by which the other
+With `--factor` a second coverage stands next to the first: each log's covariance of the bias times a factor by which the other
 logs' 68 % ellipsoids hold 68 % of their windows (split conformal prediction, with the logs as the sample). With `--learned` the
 logarithm of that factor is a linear function of a window's motion (`support.covariance_factors`), learned from the other logs
 by the likelihood of their errors: a covariance as one more head of the model, as AirIMU has (Qiu et al., arXiv 2310.04874).

@@ -1,7 +1,7 @@
-"""A ROS 1 bag with an IMU and images to MCAP: imutool convert beside rosbags-convert, in one run; and a table of text.
+"""A ROS 1 bag with an IMU and images to MCAP: imutool convert against rosbags-convert, in one run; and a table of text.
 
     python tests/bench/convert.py [--megabytes 2000]
-    python tests/bench/convert.py --rows 1440000       # two hours at 200 Hz, beside a python that reads them with NumPy
+    python tests/bench/convert.py --rows 1440000       # two hours at 200 Hz, against a python that reads them with NumPy
 
 Each command runs alone in a process of its own, three times in turn; the least of each figure counts. rosbags-convert writes
 without compression, so imutool does too in a row of its own.

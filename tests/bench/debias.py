@@ -5,9 +5,9 @@ In memory, for each model (all that ship, unless named): the stream over all sam
 node has it unless it gives a start. Times are the least of some rounds: what the machine does besides only adds.
 
 As a whole, unless `--in-memory`: `imutool debias` as a user types it, with a neural_ode of random weights (time does not depend
-on them), a process of its own with python and torch to start, beside `cp` of the same log, and beside a python that does
+on them), a process of its own with python and torch to start, next to `cp` of the same log, and against a python that does
 nothing but import torch; the same work inside a running process is timed too, and shows what of it is the start. Medians of
-interleaved rounds after one that does not count; CPU seconds stand beside wall seconds because the machine may be shared. The
+interleaved rounds after one that does not count; CPU seconds stand next to wall seconds because the machine may be shared. The
 log is in the page cache, as it is for `cp`. Everything on one thread.
 """
 

@@ -36,7 +36,7 @@ from imutool.blind_cases.envelope import to_truth
 from imutool.blind_cases.random_case import SIZES
 from imutool.errors import DataError, ImutoolError
 
-PAIRS, DRIVEN, NOTHING = 36, 15, 20  # in the deck, beside one of each effect and form at each size
+PAIRS, DRIVEN, NOTHING = 36, 15, 20  # in the deck, next to one of each effect and form at each size
 NAVIGATION = {"earth_rotation"}  # shown to no other grade
 FOUND = "found"
 

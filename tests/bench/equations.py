@@ -1,4 +1,4 @@
-"""Physics without a name, beside pysindy on the same cases: `python tests/bench/equations.py DIR [--seed S] [--each N]`.
+"""Physics without a name, against pysindy on the same cases: `python tests/bench/equations.py DIR [--seed S] [--each N]`.
 
 An arm has one term that no catalogue names, in N draws of each of six forms. `imutool diagnose` and pysindy's STLSQ (de Silva
 et al., PySINDy, JOSS 2020) answer from the same efforts, angles, speeds and accelerations: recorded less simulated at the

@@ -3,7 +3,7 @@
     python tests/bench/few_logs.py LOG.mcap... [--logs 3] [--set model.remainder=false]
 
 Each set of neighbours in the row of logs is trained on once. AOE in degrees, mean over the other logs and over the starts; and
-the drift of attitude in windows of 5 s from the truth (root mean square), beside what the model's covariance lets one expect.
+the drift of attitude in windows of 5 s from the truth (root mean square), next to what the model's covariance lets one expect.
 A data set's test sequences do not belong here: settings are chosen by these figures.
 """
 

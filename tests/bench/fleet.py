@@ -32,7 +32,7 @@ from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.log import Log
 from imutool.sensor.made_up_flight import flight
 
-IMAGE_BYTES, IMU_PER_IMAGE = 250_000, 20  # 10 images a second beside 200 Hz
+IMAGE_BYTES, IMU_PER_IMAGE = 250_000, 20  # 10 images a second next to 200 Hz
 MODEL = "euroc-adis16448-hybrid"
 LARGER = 4
 

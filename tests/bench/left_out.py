@@ -8,7 +8,7 @@ For each log the effects of `hybrid` (without the neural ODE, which would take a
 the log is integrated from every start; AOE in degrees. How long a start from the truth takes, which starts are worth their
 name, and whether an effect earns its place was asked here. With `--switched-on-again` a usual turn-on bias is added to the log
 left out, within the hours of its session. With `--minute` it is the other way round: `train`'s closed form
-on the middle minute of each log alone, scored on all others beside raw samples and `static` (mean AOE of these logs). How much
+on the middle minute of each log alone, scored on all others next to raw samples and `static` (mean AOE of these logs). How much
 of that the minute has to cost: the last columns hold the orientation by which models differ whose parameters are drawn from the
 deviations that the minute leaves, each started in the log as its own model is (root mean square over `DRAWS`).
 """

@@ -1,11 +1,11 @@
-"""Every command on small, large and many logs beside its peers: `python tests/bench/performance.py [--gb 0.4] [--in FOLDER]`.
+"""Every command on small, large and many logs against its peers: `python tests/bench/performance.py [--gb 0.4] [--in FOLDER]`.
 
 A line a command: CPU and wall seconds and memory of the whole process, the least of `--rounds` after one round that does not
 count, and the ratio of its CPU time to that of a peer in the same run. Peers: python importing what a command cannot do
 without, `cp` of the log, a shell loop of `cp`. The small log is a made-up flight of 90 s with true poses; the large one has
 images and IMU messages in every chunk (`tests/bench/rewrite.py`); many are logs of 2 MB of that kind
 (`tests/bench/fleet.py`). The long one is a made-up flight of `--hours`. Its commands run once, as do diagnosis and training:
-of the flight beside its simulation, and of each of `--recordings LOG...` alone and beside its simulation; one training of all
+of the flight against its simulation, and of each of `--recordings LOG...` alone and against its simulation; one training of all
 of them (on EuRoC: MH_01, MH_03, MH_05, V1_02, V2_01, V2_03).
 """
 

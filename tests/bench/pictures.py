@@ -83,7 +83,7 @@ def paper(browser: Any, page_path: Path, scheme: str) -> Any:
 
 
 def draws(picture: Any) -> bool:
-    """Whether the errors of both paths are drawn, which are beside every tab. The viewer itself has blue."""
+    """Whether the errors of both paths are drawn, which are next to every tab. The viewer itself has blue."""
     return min(VIEWERS.drawn(picture, color) for color in (RAW_COLOR, MODEL_COLORS[0])) >= MIN
 
 

@@ -26,7 +26,7 @@ CLOSE = 0.9  # as near to the wanted misfit as `random_case.sized` comes
 
 @dataclass(frozen=True, eq=False)
 class PoseDetectability(Detectability):
-    """Detectability beside poses with white noise `pose_noise` (m, rad)."""
+    """Detectability against poses with white noise `pose_noise` (m, rad)."""
 
     pose_noise: tuple[float, float] = POSE_NOISE
 
@@ -48,7 +48,7 @@ def pose_noise_power(
 
 
 def beside_poses(scene: Scene, pose_noise: tuple[float, float] = POSE_NOISE) -> PoseDetectability:
-    """Detectability of misfits in a scene beside noisy poses."""
+    """Detectability of misfits in a scene against noisy poses."""
     return with_catalogue(PoseDetectability(scene, scene.t_s[::DECIMATION], {}, pose_noise))
 
 

@@ -3,7 +3,7 @@
 DATA holds euroc, tumvi and fetch, as their authors ship them or as logs (*.mcap). For every sequence, training and test, apart:
 `imutool diagnose` as a person types it, and a fixed set of effects fitted whether they show or not (`diagnose.measured`). Then,
 for each sensor: what comes up in all, most or one of the sequences, how far the parameters agree, and what the training
-sequences' physics brings on the test sequences: rms beside their own poses, and orientation by `evaluate`.
+sequences' physics brings on the test sequences: rms against their own poses, and orientation by `evaluate`.
 
 The training sequences' physics: effects that last (no bias, no stamps) and came up in at least half of them, fitted to each,
 combined by their information, and kept where the sequences agree that they are not nothing. `--together` has `imutool diagnose`
@@ -214,7 +214,7 @@ def residual_to_truth(real: Path, chosen: Chosen = ()) -> dict[str, Closer]:
 
 
 def gained(log: Log, physics: Path) -> dict[str, Any]:
-    """What the physics of other sequences brings on this one: rms beside its own poses, and the orientation it integrates to.
+    """What the physics of other sequences brings on this one: rms against its own poses, and the orientation it integrates to.
 
     A bias alone and the physics both start from the truth's first fifteen seconds and keep that bias: no stop or gravity helps.
     """

@@ -105,7 +105,7 @@ def position_lags_s(pair: Pair) -> Iterator[tuple[float, float]]:
 def arms_mm(recording: Recording) -> Iterator[str]:
     """Height of the lever arm as it is fitted up to some frequencies, whatever the poses know, and as far as they do.
 
-    It is fitted beside what every unit has a little of.
+    It is fitted next to what every unit has a little of.
     """
     settings = DiagnoseSettings()
     pairs = [without_unusable(pair, settings.reference) for pair in align(recording, None, None, settings)]

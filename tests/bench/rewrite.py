@@ -1,4 +1,4 @@
-"""What `imutool debias` costs beside `cp` of the log: `python tests/bench/rewrite.py [--gb 1.5] [--rounds 3] [--in FOLDER]`.
+"""What `imutool debias` costs next to `cp` of the log: `python tests/bench/rewrite.py [--gb 1.5] [--rounds 3] [--in FOLDER]`.
 
 The log is the usual and worst one: a 200 Hz IMU interleaved with images in every chunk of 1 MiB, half of them packed
 already and half not, in three compressions; then one whose IMU has chunks of its own. Each job is a process of its own, all

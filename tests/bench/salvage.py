@@ -1,4 +1,4 @@
-"""Damaged logs: `python tests/bench/salvage.py [MEGABYTES]`, IMU messages saved of those in undamaged chunks, beside others.
+"""Damaged logs: `python tests/bench/salvage.py [MEGABYTES]`, IMU messages saved of those in undamaged chunks, against others.
 
 A log of 2001 IMU messages with images in every chunk is damaged in the ways that happen; each reader saves what it can in a
 process of its own, and every message it gives back is held against the original: `bad` ones differ from all of those. The

@@ -113,7 +113,7 @@ def parameter_rows(measured: Mapping[str, Mapping[str, Value]]) -> dict[str, dic
 
 
 def consistency_table(measured: Mapping[str, Mapping[str, Value]], published: Mapping[str, float] | None = None) -> str:
-    """A row a parameter: mean over the sequences, spread, z; beside what is published, where something is."""
+    """A row a parameter: mean over the sequences, spread, z; against what is published, where something is."""
     head = ["parameter", "seen in", "mean", "spread", "stated ± (median)", "z", *(["published"] if published else [])]
     rows = []
     for name, values in parameter_rows(measured).items():
@@ -159,7 +159,7 @@ def findings_table(diagnoses: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def gain_table(gains: Mapping[str, Mapping[str, Any]]) -> str:
-    """A row a test sequence: rms beside its own poses, and orientation, without and with what the training sequences showed."""
+    """A row a test sequence: rms against its own poses and orientation, without and with what the training sequences showed."""
     head = ["test sequence", "gyro rms (rad/s)", "accel rms (m/s²)", "AOE raw → bias → physics (°)", "5 s windows (°)"]
     rows = []
     for name, one in gains.items():

@@ -2,8 +2,8 @@
 
     python tests/bench/store.py [LOG.mcap]        without a log: 25 MB made up, images and an IMU in the same chunks
 
-Of every way of caching that fsspec has: how many GETs, beside the fewest there can be with blocks of that size (each byte
-that the pass needs, once), and how many bytes beside those the log has. Runs its own S3 server on loopback.
+Of every way of caching that fsspec has: how many GETs, against the fewest there can be with blocks of that size (each byte
+that the pass needs, once), and how many bytes against those the log has. Runs its own S3 server on loopback.
 """
 
 from __future__ import annotations

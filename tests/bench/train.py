@@ -19,7 +19,7 @@ All contestants take 1000 segments of 16 samples (the paper's batch), gyro stage
     losses must stay the same, or this stops).
 
 (a) is also timed as `imutool train` really arranges a step, with the default settings' long windows.
-Medians of interleaved rounds, after one that does not count. CPU seconds stand beside wall seconds because the machine
+Medians of interleaved rounds, after one that does not count. CPU seconds stand next to wall seconds because the machine
 may be shared. Ours runs in float64 as in training, the released code in float32 as it does.
 """
 

@@ -2,7 +2,7 @@
 
 Real IMU, simulated tracks (`imutool.vio`), raw and with each model, with bias states and without. Each figure is the mean over
 `--seeds` draws of landmarks and pixel noise, with its spread: one draw says little, for the noise of the tracks alone moves the
-AOE by tenths of a degree. Beside it the VIO column of the paper's table V (OpenVINS on the real images), where it has one.
+AOE by tenths of a degree. Next to it the VIO column of the paper's table V (OpenVINS on the real images), where it has one.
 """
 
 from __future__ import annotations

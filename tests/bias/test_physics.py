@@ -197,7 +197,7 @@ def test_a_log_is_debiased_by_the_physics_that_made_it(trajectory: Path, ideal: 
     assert report.models == {"/imu0": "physics"}
     assert "bias of physics.toml" in report.starts["/imu0"].how
     clean, noisy = read(tmp_path / "clean.mcap", imu="/imu0/debiased"), read(raw)
-    for sensor, share in (("gyro", 0.2), ("accel", 0.5)):  # beside white noise of 2.4e-3 rad/s and 0.03 m/s²
+    for sensor, share in (("gyro", 0.2), ("accel", 0.5)):  # next to white noise of 2.4e-3 rad/s and 0.03 m/s²
         before, after = (
             np.sqrt(np.mean((getattr(one.imu, sensor) - getattr(ideal.imu, sensor)) ** 2)) for one in (noisy, clean)
         )

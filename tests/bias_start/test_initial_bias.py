@@ -267,7 +267,7 @@ def test_what_the_gyro_does_not_show_is_no_bias(biased: Recording, what: str) ->
 
 
 def test_poses_that_jump_and_are_back_at_once_are_no_bias(biased: Recording) -> None:
-    """One step of the comparison shows the jump, those beside it half of it: what is left out has to be the whole."""
+    """One step of the comparison shows the jump, those next to it half of it: what is left out has to be the whole."""
     t = seconds(biased.truth.t_ns, int(biased.imu.t_ns[0]))
     away = np.radians(3.5) * np.interp(t, [8.0, 8.1, 8.2, 8.3], [0.0, -1.0, 1.0, 0.0])[:, None] * [0.6, 0.0, 0.8]
     turned = (Rotation.from_quat(biased.truth.q_wb_wxyz, scalar_first=True) * Rotation.from_rotvec(away)).as_quat(

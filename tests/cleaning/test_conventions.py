@@ -196,7 +196,7 @@ def test_a_part_that_fits_any_delay_shows_no_step() -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_quaternions_of_another_world_than_the_positions_are_named(sign: float, flown: tuple[Imu, Truth]) -> None:
-    """NED beside ENU, either way round: not an accelerometer that is reversed, which looks alike."""
+    """NED next to ENU, either way round: not an accelerometer that is reversed, which looks alike."""
     imu, truth = flown
     in_ned = truth._replace(q_wb_wxyz=read_right(OTHER_WORLD, truth.q_wb_wxyz))
     both = in_ned._replace(p_wb=truth.p_wb[:, [1, 0, 2]] * [1, 1, -1])
@@ -465,7 +465,7 @@ def looked(imu: Imu, truth: Truth | None, *, fix: bool) -> Survey:
 
 
 def test_a_delay_just_below_what_is_warned_of_is_corrected() -> None:
-    """Commands judge other samples of a log than `fix` does: what they refuse must not be just beside what it leaves."""
+    """Commands judge other samples of a log than `fix` does: what they refuse must not be just next to what it leaves."""
     imu, poses = turned(waves(60.0, (0.5, 0.4, 0.6)))
     truth = of_poses("/truth", poses)
     assert truth is not None

@@ -462,7 +462,7 @@ def test_an_axis_that_is_clipped_before_its_calibration_is_saturated_and_a_const
 
 
 def test_a_sensor_that_rests_on_its_side_is_at_no_end_of_its_range() -> None:
-    """Beside motion to the other side, its noise at rest was said to be flat near -9.3 m/s²."""
+    """Next to motion to the other side, its noise at rest was said to be flat near -9.3 m/s²."""
     rng, t = np.random.default_rng(0), np.arange(4000) / 100.0
     rests, moves = -9.3 + 0.004 * rng.normal(size=len(t)), 1.5 + 7.0 * np.sin(t) + 0.5 * rng.normal(size=len(t))
     values = np.where(t < 6.0, rests, np.maximum(moves, -8.0))

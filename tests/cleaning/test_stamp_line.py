@@ -69,8 +69,8 @@ def test_stamps_that_are_late_by_up_to_a_period_are_led_back_and_lost_samples_st
     assert usual_period(stamps) == pytest.approx(PERIOD_NS, rel=0.01)
     off = np.abs(restamped(stamps) - true)
     assert np.quantile(off, 0.999) < (0.6e6 if late_ns else 1000)
-    assert off.max() <= late_ns + 6000  # beside a lost sample that late stamps hide
-    assert missing(stamps, usual_period(stamps)).sum() == len(lost)  # late ones beside a lost one do not count
+    assert off.max() <= late_ns + 6000  # next to a lost sample that late stamps hide
+    assert missing(stamps, usual_period(stamps)).sum() == len(lost)  # late ones next to a lost one do not count
 
 
 @pytest.mark.parametrize("periods", [1.5, 3.0, 6.0])

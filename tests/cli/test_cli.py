@@ -331,7 +331,7 @@ def test_a_table_too_wide_goes_on_below_with_its_keys(
 def test_a_row_whose_value_is_folded_begins_in_its_first_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The topic and the property stood beside the last line of the value."""
+    """The topic and the property stood next to the last line of the value."""
     monkeypatch.setattr(terminal, "out", type(terminal.out)(width=30, force_terminal=True, no_color=True, highlight=False))
     terminal.table([("topic", "value"), ("/imu0", "cannot be judged: the log has no poses")], keys=1)
     shown = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out).splitlines()

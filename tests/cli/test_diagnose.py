@@ -77,7 +77,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def diagnosed(folder: Path, imutool: Command) -> tuple[Path, Done]:
-    """The folder that the command wrote about the lever arm, with a process beside it, and what it said."""
+    """The folder that the command wrote about the lever arm, with a process next to it, and what it said."""
     (folder / "bytes.py").write_text("import pathlib, sys\nprint(len(pathlib.Path(sys.argv[2]).read_bytes()))\n")
     closed = ("--close", "--metric", folder / "bytes.py", "--sim", folder / "ideal.mcap")
     words = ("-o", folder / "diagnosis", "--json", folder / "said.json", *closed)
@@ -207,7 +207,7 @@ def test_the_conclusion_comes_first(diagnosed: tuple[Path, Done]) -> None:
 def test_nothing_is_found_where_nothing_was_left_out(folder: Path, imutool: Command) -> None:
     said = imutool("diagnose", folder / "null.mcap", "--json", "-", cwd=folder)
     assert said.returncode == 0, said.stderr
-    told = json.loads(said.stdout)  # the JSON, and nothing beside it
+    told = json.loads(said.stdout)  # the JSON, and nothing next to it
     assert not told["mismatch"]
     assert told["findings"] == []
     assert told["located"] == []

@@ -273,7 +273,7 @@ def test_a_folder_that_is_a_file_is_refused(refused: Refused, tmp_path: Path, co
 def test_a_file_about_a_log_in_a_folder_of_others_is_refused_before_any_work(
     refused: Refused, tmp_path: Path, command: str, option: str, name: str
 ) -> None:
-    """The log is junk, which is not even looked at; files about other logs stay beside the new ones."""
+    """The log is junk, which is not even looked at; files about other logs stay next to the new ones."""
     (tmp_path / "in.mcap").write_bytes(b"junk")
     (tmp_path / "a b.mcap").write_bytes(b"junk")
     (tmp_path / "out").mkdir()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -157,3 +158,13 @@ def test_an_error_names_the_parameter_in_python_and_the_flag_on_the_command_line
         cli.main()
     printed = capsys.readouterr().err
     assert printed.lstrip() == "error: --init: 'x'; expected auto or six numbers. Give --init prior with a trained --model.\n"
+
+
+def test_a_help_names_values_and_no_types_of_python(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        COMMANDS["clean"].main(["--help"], "imutool clean")
+    shown = dict(re.findall(r"(--(?:imu|init|smooth|report))  +(\S+)", capsys.readouterr().out))
+    assert shown == {"--imu": "TOPIC", "--init": "INIT", "--smooth": "Use", "--report": "F.html"}

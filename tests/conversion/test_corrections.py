@@ -104,7 +104,7 @@ def test_positions_in_other_units_come_back_in_metres(scale: float, made: Record
 
 
 def test_a_turned_body_of_the_poses_comes_back_to_the_imu(made: Recording, tmp_path: Path) -> None:
-    """Poses of another frame than the IMU's, as of a marker that was mounted askew, and the transform beside them."""
+    """Poses of another frame than the IMU's, as of a marker that was mounted askew, and the transform next to them."""
     turn = Rotation.from_rotvec([20.0, -30.0, 25.0], degrees=True)
     true = Rotation.from_quat(made.truth.q_wb_wxyz.copy(), scalar_first=True)
     askew = replace(made.truth, q_wb_wxyz=(true * turn).as_quat(scalar_first=True))
@@ -303,7 +303,7 @@ def test_a_small_delay_does_not_turn_the_body(tmp_path: Path) -> None:
 
 
 def test_poses_of_another_frame_keep_their_clock(tmp_path: Path) -> None:
-    """Odometry on the IMU's clock, in a frame of its own, beside a motion capture on another clock."""
+    """Odometry on the IMU's clock, in a frame of its own, next to a motion capture on another clock."""
     made = flight(3, duration_s=40.0, rate_hz=50.0, truth_rate_hz=25.0)
     late = replace(made.truth, t_ns=made.truth.t_ns + 3_600 * 10**9)
     write(replace(made, truths={"/mocap/pose": late, "/odom/pose": made.truth}), tmp_path / "both.mcap")

@@ -79,7 +79,7 @@ def converted(source: Path, out: Path) -> ConvertReport:
 
 
 def refused(source: Path, match: str) -> None:
-    """The source is refused, and nothing is left of it, neither beside the target nor anywhere above."""
+    """The source is refused, and nothing is left of it, neither next to the target nor anywhere above."""
     out = source.parents[1] / "out"
     before = sorted(source.parents[1].rglob("*"))
     with pytest.raises(DataError, match=match) as error:
@@ -262,7 +262,7 @@ def test_more_than_half_of_the_free_disk_is_refused(log: Path, ending: str, monk
         source.write_bytes(gzip.compress(log.read_bytes()))
     usage = shutil.disk_usage(log)._replace(free=log.stat().st_size)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    refused(source, "half of the free disk beside the target.*larger disk")
+    refused(source, "half of the free disk of the target.*larger disk")
 
 
 def test_a_failure_names_the_packed_file(log: Path) -> None:

@@ -304,7 +304,7 @@ def test_a_map_and_the_poses_that_it_names_are_never_the_target(tmp_path, out):
 def test_a_read_only_target_is_refused(source):
     with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):
         convert(source / "a", Path("/proc/a.mcap"))
-    with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):  # and no temporary folder beside it
+    with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):  # and no temporary folder next to it
         convert(source / "a", Path("/proc/a.mcap"), fix=True)
     with pytest.raises(ConfigError, match="/proc/imutool: cannot be made"):
         convert(source, Path("/proc/imutool"))
@@ -411,7 +411,7 @@ def test_converting_needs_no_torch():
         (b'<?xml version="1.0"?>\n<!-- ' + 300 * b"a" + b' -->\n<mvnx version="3">', "Xsens MVN.*sensors measured"),
         (b"\x20\x0c" + 8 * (b"\xfa\xff\x36\x44" + bytes(69)), "Xsens sensor.*MT Manager"),
         (b"\x80\x04\x95\x0f\x00\x00\x00\x00\x00\x00\x00}\x94\x8c\x03acc\x94K\x01s.", "pickle of Python.*numpy.savez"),
-        (b"\x02P,\x00", "C3D file.*beside the table"),
+        (b"\x02P,\x00", "C3D file.*together with the table"),
         (
             b"#group,false\r\n#default,_result\r\n,table,_time,_value,_field\r\n,0,2024-05-01T12:00:00Z,0.1,gx\r\n",
             r"long.*Pivot",
@@ -503,7 +503,7 @@ def test_a_folder_of_own_logs_alone_can_be_converted_again_but_never_what_it_wro
         again = convert(logs, logs / "again", overwrite=overwrite)
         assert sorted(path.name for path in again.written) == ["a.mcap", "b.mcap", "c.mcap"]
     sequence(logs / "raw")
-    (written,) = convert(logs, tmp_path / "beside").written  # own logs beside a source are none
+    (written,) = convert(logs, tmp_path / "beside").written  # own logs next to a source are none
     assert read(written).name == "raw"
 
 
@@ -583,7 +583,7 @@ def test_an_acquisition_of_st_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("jumps", [False, True])
 def test_a_topic_on_a_clock_of_its_own_is_no_jump_of_the_clock(tmp_path: Path, jumps: bool, imutool) -> None:
-    """As GNSS beside an IMU, in seconds of the week and since the start."""
+    """As GNSS next to an IMU, in seconds of the week and since the start."""
     t_s, vectors = np.arange(300) / 100.0, np.random.default_rng(5).normal([0, 0, 0, 0, 0, 9.81], 0.1, (300, 6))
     t_s[150:] += 7200.0 * jumps
     (tmp_path / "drive").mkdir()

@@ -81,7 +81,7 @@ def as_flatbuffer(n: int, t_ns: int) -> bytes:
 
 
 def write_log(path: Path, encoding: str, *, lacking: int | None = None, size: float = 1.0) -> Path:
-    """Log of an IMU with a topic beside it; the message `lacking` has no acceleration, JSON's are `size` times as large."""
+    """Log of an IMU with a topic next to it; the message `lacking` has no acceleration, JSON's are `size` times as large."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -206,7 +206,7 @@ def test_a_ros2_type_with_rates_and_accelerations_is_an_imu_where_the_log_has_no
 
 
 def test_poses_in_another_encoding_have_a_kind_and_serve_as_truth(convert, imutool, tmp_path):
-    """foxglove.PoseInFrame in JSON on a topic of motion capture, and an odometry beside it."""
+    """foxglove.PoseInFrame in JSON on a topic of motion capture, and an odometry next to it."""
     with (tmp_path / "in.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()

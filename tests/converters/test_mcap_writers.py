@@ -1,4 +1,4 @@
-"""MCAP logs of other writers: what their summaries leave out, and what stands beside the messages."""
+"""MCAP logs of other writers: what their summaries leave out, and what stands next to the messages."""
 
 from __future__ import annotations
 

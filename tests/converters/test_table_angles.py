@@ -1,4 +1,4 @@
-"""Roll, pitch and yaw in tables: the unit of the gyro by them, true angles beside IMUs, and what is no orientation."""
+"""Roll, pitch and yaw in tables: the unit of the gyro by them, true angles next to IMUs, and what is no orientation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of other programs: their names of axes, their units, their times, and poses beside the IMU."""
+"""Tables of other programs: their names of axes, their units, their times, and poses next to the IMU."""
 
 from __future__ import annotations
 

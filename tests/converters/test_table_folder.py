@@ -162,7 +162,7 @@ def test_a_folder_of_gnss_ins_sim_has_its_times_in_a_table_of_their_own(tmp_path
 
 
 def test_of_a_table_of_one_sensor_x_y_and_z_are_the_axes(tmp_path):
-    """PX4's sensor_gyro has three counters beside them."""
+    """PX4's sensor_gyro has three counters next to them."""
     names = ["timestamp", "timestamp_sample", *(f"clip_counter[{k}]" for k in range(3)), *"xyz"]
     t_us, zero = 1e6 * T_S, np.zeros((COUNT, 3))
     for sensor, values in (("gyro", GYRO), ("accel", ACCEL)):
@@ -375,7 +375,7 @@ def test_of_several_accelerometers_the_one_with_no_further_word_is_asked_about(t
 
 
 def test_tables_with_a_clock_of_a_name_of_their_own_keep_it(tmp_path):
-    """Columns beside `imuTimestamp` and `utcTimestamp(nanos)` of another length were left out, as if they had no time."""
+    """Columns next to `imuTimestamp` and `utcTimestamp(nanos)` of another length were left out, as if they had no time."""
     named = "imuTimestamp,utcTimestamp(nanos)," + "{0}_x[{1}],{0}_y[{1}],{0}_z[{1}]\n"
     utc_ns, boot_ms = np.round(1e9 * T_S).astype(np.int64), np.arange(COUNT) * 10
     for name, title, unit, values in (("accelerometer", "acc", "m/s^2", ACCEL), ("gyroscope", "ang_vel", "rad/s", GYRO)):
@@ -543,7 +543,7 @@ def test_a_narrow_table_beside_an_imu_keeps_its_readings(tmp_path):
 
 
 def test_tables_of_a_folder_that_show_no_imu_are_named(tmp_path, caplog):
-    """As those of a device whose columns have no known names, beside one that is read."""
+    """As those of a device whose columns have no known names, next to one that is read."""
     names = ["t [s]", *(f"g{a} [rad/s]" for a in "xyz"), *(f"a{a} [m/s^2]" for a in "xyz")]
     for name in ("walk", "run"):
         write_csv(tmp_path / f"{name}.csv", names, [T_S, *GYRO.T, *ACCEL.T])
@@ -555,7 +555,7 @@ def test_tables_of_a_folder_that_show_no_imu_are_named(tmp_path, caplog):
 
 
 def test_tables_of_a_folder_of_imus_that_show_none_are_named(tmp_path, caplog):
-    """Beside markers of a motion capture they were left out without a word."""
+    """Next to markers of a motion capture they were left out without a word."""
     for folder in ("imu", "vicon"):
         (tmp_path / folder).mkdir()
     names = ["t [s]", *(f"g{a} [rad/s]" for a in "xyz"), *(f"a{a} [m/s^2]" for a in "xyz")]

@@ -1,4 +1,4 @@
-"""True latitude, longitude and height beside angles: positions about the first, where gravity shows the world of the angles."""
+"""True latitude, longitude and height with angles: positions about the first, where gravity shows the world of the angles."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def rows(*values: np.ndarray) -> str:
 
 
 def recorded(folder: Path, unit: str, down: float, head: str = "latitude [{0}],longitude [{0}],altitude [m]") -> MessageLog:
-    """Log of an IMU beside true angles; `down` is 1 where the z axis of their world points down."""
+    """Log of an IMU next to true angles; `down` is 1 where the z axis of their world points down."""
     rotation = Rotation.from_euler("ZYX", ANGLES[:, ::-1])
     turns = (rotation[:-1].inv() * rotation[1:]).as_rotvec() * 100.0
     force = rotation.inv().apply([0.0, 0.0, -9.81 * down])
@@ -82,7 +82,7 @@ def test_small_angles_without_a_unit_are_no_positions(tmp_path):
 
 @pytest.mark.parametrize("head", ["latitude [deg],longitude [deg],altitude [m]", "easting,northing,height"])
 def test_positions_on_the_earth_beside_quaternions_in_a_world_with_z_up_are_east_north_up(tmp_path, head):
-    """As those of GNSS beside the orientation of an IMU that ROS has."""
+    """As those of GNSS next to the orientation of an IMU that ROS has."""
     rotation = Rotation.from_euler("ZYX", ANGLES[:, ::-1])
     turns = (rotation[:-1].inv() * rotation[1:]).as_rotvec() * 100.0
     imu = "time [s],gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s],acc_x [m/s^2],acc_y [m/s^2],acc_z [m/s^2]\n"

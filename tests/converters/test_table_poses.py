@@ -1,4 +1,4 @@
-"""Poses beside an IMU's table: exports of motion captures, trajectories, and files that give none; and packed tables."""
+"""Poses next to an IMU's table: exports of motion captures, trajectories, and files that give none; and packed tables."""
 
 from __future__ import annotations
 
@@ -565,7 +565,7 @@ def test_a_heading_counts_from_the_first_axis_of_the_positions(tmp_path, names):
 
 @pytest.mark.parametrize("named", ["b_{}_{}", "bias_{}_{}", "b_{}_RS_S_{}"])
 def test_biases_of_an_estimate_are_no_imu(tmp_path: Path, named: str) -> None:
-    """As OKVIS, VIO programs and EuRoC name them, beside positions `p_WS_W_x`."""
+    """As OKVIS, VIO programs and EuRoC name them, next to positions `p_WS_W_x`."""
     (tmp_path / "imu.csv").write_text(imu_text())
     words = {"b_{}_{}": ("g", "a"), "bias_{}_{}": ("gyro", "acc"), "b_{}_RS_S_{}": ("w", "a")}[named]
     biases = [

@@ -104,7 +104,7 @@ def test_rows_of_several_kinds_do_not_hide_one_another(tmp_path):
 
 
 def test_rows_of_several_kinds_that_a_spreadsheet_made_equally_long_are_told_apart(tmp_path):
-    """Quaternions of a sensor beside its readings, with the commas that a spreadsheet adds."""
+    """Quaternions of a sensor next to its readings, with the commas that a spreadsheet adds."""
     lines = []
     for number, (gyro, accel) in enumerate(zip(GYRO.tolist(), ACCEL.tolist(), strict=True)):
         lines += [row(",", 10 * number, 2, *accel, *gyro), row(",", 10 * number, 3, 1.0, 0.0, 0.0, 0.0, "", "")]

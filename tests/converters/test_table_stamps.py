@@ -92,7 +92,7 @@ def test_milliseconds_are_no_hours_minutes_and_seconds(tmp_path: Path, step: int
 
 
 def test_a_time_that_only_rises_has_a_stamp_for_each_row(tmp_path: Path) -> None:
-    """Beside the time of a program that stands still for batches it is taken, and nothing is said of batches."""
+    """Next to the time of a program that stands still for batches it is taken, and nothing is said of batches."""
     rows = lines(STAMPS_MS + 10**12, T_NS[:, None] // 1_000_000 + 1_700_000_000_000, GYRO, ACCEL)
     (tmp_path / "log.csv").write_text("\n".join(["time,millis,gx,gy,gz,ax,ay,az", *rows]) + "\n")
     log = table.read_sequence(table.sequences(tmp_path)[0], mapping={"gyro_unit": "rad/s"})

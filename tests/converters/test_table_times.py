@@ -285,7 +285,7 @@ def test_a_clock_behind_other_columns_is_the_time(tmp_path):
 
 
 def test_recordings_in_one_structure_become_logs_with_their_own_times(tmp_path):
-    """Also those with as many samples, and the columns beside an IMU."""
+    """Also those with as many samples, and the columns next to an IMU."""
     trial = {"t": T_S, "acc": ACCEL, "gyr": GYRO, "mag": ACCEL}
     for later, rows in ((500.0, COUNT), (90.0, COUNT - 700)):
         second = {name: values[:rows] + (later if name == "t" else 0.0) for name, values in trial.items()}

@@ -187,7 +187,7 @@ def test_a_table_of_ulog2csv_is_in_the_units_of_px4(tmp_path):
 
 
 def test_matrices_as_matlab_writes_them_in_a_table(tmp_path):
-    """`acc_1` to `acc_3`: their rate stands in a comment, and the orientation beside them shows the gyro's unit."""
+    """`acc_1` to `acc_3`: their rate stands in a comment, and the orientation next to them shows the gyro's unit."""
     t_s = np.arange(2000) * 0.01
     turned = Rotation.from_rotvec(np.stack([0.4 * np.sin(2 * t_s), 0.5 * np.sin(3 * t_s), 0.3 * np.cos(2 * t_s)], axis=1))
     gyro = np.vstack([(turned[:-1].inv() * turned[1:]).as_rotvec() * 100.0, np.zeros((1, 3))])

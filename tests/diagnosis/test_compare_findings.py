@@ -188,7 +188,7 @@ def test_a_recording_that_contradicts_the_others_is_named(
 
 
 def test_a_recording_of_another_clock_is_named_by_its_clock(tmp_path: Path) -> None:
-    """Beside one simulation of all three; two matrices do a part of it."""
+    """Against one simulation of all three; two matrices do a part of it."""
     felt, paths = planted.rich(3, 60.0), []
     for name, late_s in (("first", 0.0), ("second", 0.0), ("third", 0.02), ("sim", None)):
         effects = {} if late_s is None else {"gyro_scale": SCALE, "clock_offset": [late_s]}

@@ -85,21 +85,21 @@ def begin(recording: Recording, seconds: float = 8.0) -> Recording:
 
 @pytest.fixture(scope="module")
 def nothing(made: Made) -> tuple[Path, Path, Diagnosis]:
-    """A bias and noise, beside a simulation."""
+    """A bias and noise, against a simulation."""
     real, sim = made()
     return real, sim, diagnose([real], sim)
 
 
 @pytest.fixture(scope="module")
 def arm(made: Made) -> tuple[Path, Path, Diagnosis]:
-    """A lever arm, beside a simulation."""
+    """A lever arm, against a simulation."""
     real, sim = made({"lever_arm": ARM})
     return real, sim, diagnose([real], sim)
 
 
 @pytest.fixture(scope="module")
 def arm_by_poses(made: Made) -> tuple[Path, Diagnosis]:
-    """A lever arm, beside the recording's own poses."""
+    """A lever arm, against the recording's own poses."""
     real, _ = made({"lever_arm": ARM}, real_poses=True)
     return real, diagnose([real])
 
@@ -235,7 +235,7 @@ def test_an_offset_of_clocks_that_share_no_epoch_is_no_finding(made: Made, tmp_p
 
 
 def test_a_lag_of_another_signal_shows_by_the_clock_of_the_imu_where_the_logs_share_no_epoch(tmp_path: Path) -> None:
-    """A gauge that is late and slow, beside one that both logs copy from the motion."""
+    """A gauge that is late and slow, next to one that both logs copy from the motion."""
     rng, t_s = np.random.default_rng(4), planted.clock(40.0)
     path = planted.moving(4, 40.0)
     imu = path.imu(path.start_ns + np.round(t_s * 1e9).astype(np.int64))

@@ -19,7 +19,7 @@ FIRST, OTHER, POSES = "/camera/imu/data_raw", "/rear_unit/imu", "/mocap/base/pos
 TURNED = Rotation.from_euler("zyx", [92.0, -8.0, 5.0], degrees=True)  # takes vectors of the other to the first
 ARM, CLOCK_S, OTHER_S = np.array([-0.3, 0.12, 0.05]), 0.006, 1.0 / 160.0
 SURE = 4.0
-BRIEFLY = DiagnoseSettings(search=SearchSettings(rounds=1))  # the comparison of IMUs is beside the search
+BRIEFLY = DiagnoseSettings(search=SearchSettings(rounds=1))  # the comparison of IMUs is next to the search
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["poses", "no poses"])
@@ -56,7 +56,7 @@ def test_the_imus_of_a_log_are_compared_with_each_other(log: Path, first: str | 
     d, left_out = diagnosis_output.diagnose([log], folder=tmp_path / "out", imu=first, settings=BRIEFLY)
     assert left_out == []
     pages = [page.read_text(encoding="utf-8") for page in (tmp_path / "out").glob(diagnosis_output.LOG)]
-    assert [(first or FIRST) in page for page in pages] == [True] * bool(np.isfinite(d.bias).all())  # beside a reference
+    assert [(first or FIRST) in page for page in pages] == [True] * bool(np.isfinite(d.bias).all())  # next to a reference
     topic, R, arm, clock = (
         (OTHER, TURNED, ARM, CLOCK_S) if first is None else (FIRST, TURNED.inv(), -TURNED.inv().apply(ARM), -CLOCK_S)
     )

@@ -97,7 +97,7 @@ def near(d: Diagnosis, effect: str, truth: Mapping[str, float]) -> bool:
 
 @pytest.fixture(scope="module")
 def saturated(tmp_path_factory: pytest.TempPathFactory) -> Diagnosis:
-    """An accelerometer at half a metre a second squared throughout, beside a gyro with a scale error."""
+    """An accelerometer at half a metre a second squared throughout, next to a gyro with a scale error."""
     limit = np.array([np.inf] * 3 + [0.05] * 3)
     return diagnose([(logs := moving(tmp_path_factory.mktemp("limit"), {"gyro_scale": SCALE}, limit=limit)).real], logs.sim)
 

@@ -37,7 +37,7 @@ WARMTH = PhysicsFile(
     effect=(Entry(name="temperature", parameters={"gyro_x": Value(value=1e-3, unit="rad/s per K")}),),
     bias=Bias(gyro=(0.01, 0.0, 0.0), accel=(0.0, 0.0, 0.0)),
 )
-READ = 0.01  # of the change that the physics makes: a spline at 100 Hz reads so far beside it
+READ = 0.01  # of the change that the physics makes: a spline at 100 Hz reads so far next to it
 
 
 def sensor(acting: Acting = (), scalars: dict[str, Scalars] | None = None) -> Recording:
@@ -74,7 +74,7 @@ def test_a_simulated_imu_that_sits_beside_its_poses_stays_there(tmp_path: Path, 
 
 @pytest.mark.parametrize("poses", [True, False])
 def test_a_simulator_that_runs_again_gets_the_physics_on_its_samples(tmp_path: Path, poses: bool) -> None:
-    """Of another motion, years later, with a sensor beside its poses and no recording."""
+    """Of another motion, years later, with a sensor next to its poses and no recording."""
     arm = [(effect, np.array([0.2, -0.1, 0.3])) for effect in catalogue.effects(["lever_arm"])]
     sim, wanted = sensor(arm), sensor([*arm, *SCALE.acting()])
     run, out, file = tmp_path / "run.mcap", tmp_path / "better.mcap", tmp_path / "physics.toml"

@@ -99,7 +99,7 @@ def test_what_lies_in_out_is_no_source_whatever_link_leads_there(tmp_path: Path)
 @pytest.mark.parametrize("out", [".", "logs"])
 def test_logs_that_all_lie_in_out_are_told_as_such(tmp_path: Path, out: str) -> None:
     tree(tmp_path, "logs/a.mcap", "logs/b.mcap")
-    with pytest.raises(ConfigError, match=r"its 2 logs lie below OUT .*Choose an OUT beside the logs"):
+    with pytest.raises(ConfigError, match=r"its 2 logs lie below OUT .*Choose an OUT outside the folder of the logs"):
         find(str(tmp_path / "logs"), tmp_path / out)
 
 

@@ -30,7 +30,7 @@ from fuzz.logs import (
     wrong_index,
 )
 
-# of each kind, what 60 s reached on a quiet machine, to be shared; a search by the clock would find less beside other runs
+# of each kind, what 60 s reached on a quiet machine, to be shared; a search by the clock would find less next to other runs
 CASES = {
     "archives": 75,
     "bags": 1200,

@@ -132,7 +132,7 @@ def test_poses_that_jump_are_named(sizes_deg: tuple[float, ...], warned: bool) -
 
 
 def test_a_few_large_jumps_hide_neither_the_motion_nor_the_mount() -> None:
-    """Markers are exchanged four times, for one pose each: turns of 26 rad/s beside a motion of 1 rad/s."""
+    """Markers are exchanged four times, for one pose each: turns of 26 rad/s next to a motion of 1 rad/s."""
     truth = poses()
     swapped = np.radians(150.0) * (np.arange(len(truth.t_ns)) % 70 == 40)
     R = Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True) * Rotation.from_rotvec(swapped[:, None] * [0.6, 0.0, 0.8])

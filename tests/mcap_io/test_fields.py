@@ -422,7 +422,7 @@ def test_memory_is_bounded_by_a_chunk_not_by_the_log(tmp_path: Path) -> None:
 
 
 def test_signals_of_two_logs_are_diagnosed(tmp_path: Path, write_pair: Callable[[str, Path], Path]) -> None:
-    """The whole way: an odometry twist with a gain, a joint that comes late, each beside a simulation at another rate."""
+    """The whole way: an odometry twist with a gain, a joint that comes late, each against a simulation at another rate."""
     real, sim = (write_pair(which, tmp_path / f"{which}.mcap") for which in ("real", "sim"))
     for signal, effect, value in (("/odom.twist.twist.linear.x", "gain", 1.08), ("/joint_states.position[1]", "delay", 0.03)):
         pair = SignalPair.of_fields(read_field(real, signal), read_field(sim, signal), signal)

@@ -1,4 +1,4 @@
-"""A random walk of a bias: found beside white noise, not found in white noise, and taken out of it."""
+"""A random walk of a bias: found next to white noise, not found in white noise, and taken out of it."""
 
 from __future__ import annotations
 

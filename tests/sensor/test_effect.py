@@ -589,7 +589,7 @@ def test_scale_misalignment_and_square_are_what_their_equations_say(sensor: str)
 
 
 def test_no_scale_acts_on_what_is_added_and_a_gyro_feels_the_force_as_it_is() -> None:
-    """A step beside a scale, and a sensitivity beside an accelerometer's scale, were off by their product: five deviations."""
+    """A step with a scale, and a sensitivity with an accelerometer's scale, were off by their product: five deviations."""
     taken = lively().sample(clock(), clock())
     s, added, G_xz = np.full(3, 0.05), np.array([0.2, 0.3, 0.4]), np.array([0.0, 0.0, 1e-3, *[0.0] * 6])
     names = {"gyro_scale": s, "accel_scale": s, "gyro_g_sensitivity": G_xz}

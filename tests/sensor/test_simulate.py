@@ -315,7 +315,7 @@ def test_a_log_without_poses_is_refused(tmp_path: Path, trajectory: Path) -> Non
 
 
 def test_positions_that_no_body_follows_bring_a_remark() -> None:
-    """Without an IMU beside them nothing else shows that they are in millimetres."""
+    """Without an IMU next to them nothing else shows that they are in millimetres."""
     metres = circling()
     millimetres = replace(metres, p_wb=1e3 * metres.p_wb, v_w=None)
     for truth, said in ((metres, 0), (millimetres, 1)):

@@ -28,7 +28,7 @@ def _best(recording: Recording) -> str:
 
 @functools.cache
 def benchmark(name: str) -> Any:
-    """Module of tests/bench, which is no package. It finds the others beside it; `sys.path` stays as it was."""
+    """Module of tests/bench, which is no package. It finds the others next to it; `sys.path` stays as it was."""
     spec = importlib.util.spec_from_file_location(f"bench_{name}", FOLDER / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None

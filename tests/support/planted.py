@@ -79,7 +79,7 @@ def acting(effects: Mapping[str, Sequence[float]]) -> Chosen:
 
 
 def catalogue() -> tuple[Effect, ...]:
-    """All that a fit can find beside a simulation, without another channel of the log."""
+    """All that a fit can find against a simulation, without another channel of the log."""
     others = {*SHOWN_BY_SAMPLES, "clock_wander"}
     found = (one for one in _catalogue.diagnosed() if set(one.needs) <= {"attitude"} and one.name not in others)
     return tuple(in_forms(found, exact=True))
@@ -112,7 +112,7 @@ def pair(
     bias: np.ndarray = BIAS,
     added: np.ndarray | None = None,
 ) -> Pair:
-    """A recording of a motion with effects, white noise and a bias, beside the motion itself."""
+    """A recording of a motion with effects, white noise and a bias, next to the motion itself."""
     stamp_s = felt.t_s if stamp_s is None else stamp_s
     real = ideal(felt, acting(effects or {}), stamp_s) + noise(len(stamp_s), seed) + bias
     if added is not None:

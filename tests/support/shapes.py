@@ -196,5 +196,5 @@ _looks: dict[type, Callable[[Any], Hashable] | None] = {
     ),
     str: lambda text: text if len(text) < LONGEST else str,  # a Literal is short
 }
-"""By type: what a check depends on beside the type; None where that is all."""
+"""By type: what a check depends on next to the type; None where that is all."""
 _IN_CODE = {"_ndarray": np.ndarray, "_looks": _looks.get, "_new": _look}

@@ -109,7 +109,7 @@ def euler_steps(
 ) -> Float[Tensor, "k b 3"]:
     """States from `rest` on of b' = b + step out(x), x from residual blocks.
 
-    The blocks begin with the state `(b - centre) / unit` beside the motion.
+    The blocks begin with the state `(b - centre) / unit` and the motion.
 
     `blocks` are perceptrons of residual blocks. A step is so small that the gradient of each of its operations costs more than
     the arithmetic: here the derivative runs back through the states alone, and that by the weights is one product a layer.

@@ -86,7 +86,7 @@ def _clock(delay: Delay, topic: str, whole: TopicSummary) -> Iterator[Finding]:
         yield Finding("axes", "warning", what, 1, values={"steps": topic}, confidence=0.9)
     elif abs(delay.seconds) > (FIXED if whole.settings.fix else 1.0) * max(LATE_S, LATE_STDS * delay.std_s):
         whole.pose_delay_ns = round(delay.seconds * 1e9)
-        size = f"{lateness(delay.seconds)} (standard deviation {1e3 * delay.std_s:.0f} ms)"
+        size = f"{lateness(delay.seconds)} (standard deviation {1e3 * delay.std_s:.1f} ms)"
         what = f"the stamps of the poses {topic} are {size} by the gyro"
         yield Finding("axes", "warning", what, 1, values={"fix": "move the stamps of the poses"}, confidence=0.9)
 

@@ -19,7 +19,7 @@ from imutool.cleaning.samples import Samples, padded
 from imutool.recording.columns import median, true_ranges
 
 MIN = 10  # equal samples in a row
-MAX_EQUAL = 3  # of six axes, beside a run: as one sensor does that is slower than the other
+MAX_EQUAL = 3  # of six axes, apart from a run: a sensor that is slower than the other repeats three
 AXIS_MIN, AXIS_MIN_S = 100, 1.0  # of one axis alone; the longest in real recordings is 17, or 0.17 s
 HELD_SHARE = 0.3  # of neighbours that are equal: the topic is faster than its sensor
 AXIS_DISTRUST = 0.1  # of the time

@@ -19,7 +19,7 @@ ALIKE = 1.1  # times the least squares: hypotheses that explain as much, of whic
 MIN_TURN = 0.05  # rad, from signed axes: less is a mount's misalignment
 UNSEEN = 1e-4  # of the products of signal and parts: less tells no rotation, as that about the only axis of a planar motion;
 # so rotations come out too small by up to this share
-MIN_SEEN = 0.01  # of these products, of the axis that moves least beside a turned reflection
+MIN_SEEN = 0.01  # of these products, of the axis that moves least, with a turned reflection
 MAX_BIAS = 1.0  # m/s², of the accelerometer: gravity in the world frame is none
 
 Vectors = Float64[np.ndarray, "n 3"]

@@ -51,7 +51,7 @@ NAMES = ("m", "k", "c", "x", "y", "z", "tau_a", "tau_f")
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """Samples of a log beside the motion of its poses, one row each; world vectors end in _w."""
+    """Samples of a log and the motion of its poses, one row each; world vectors end in _w."""
 
     t_s: Float64[np.ndarray, " n"]
     gyro: Vectors
@@ -176,7 +176,7 @@ def _solved(
     ideal: Float64[np.ndarray, " p"],
     small: Float64[np.ndarray, "n 3 q"],
 ) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"], Vectors]:
-    """Coefficients with deviations, and what they and the biases leave; `small` errors of the sensor are fitted beside them.
+    """Coefficients with deviations, and what they and the biases leave; `small` errors of the sensor are fitted, too.
 
     A part is the same at every frequency. What smoothing takes of a motion grows at least with the square of its frequency, and
     looks like a part. So where slower bands contradict the whole one (Hausman's test), the difference tells this error of each

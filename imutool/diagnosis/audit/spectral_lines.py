@@ -45,7 +45,7 @@ class SpectralLine(NamedTuple):
 
 
 class Spectrum(NamedTuple):
-    """Power of three axes by frequency, beside its neighbours, and whether a line is no chance."""
+    """Power of three axes by frequency and of its neighbours, and whether a line is no chance."""
 
     f_hz: Column
     power: Column

@@ -65,7 +65,7 @@ def select_effects(
     start, known, report = fit(logs, always), Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
     first = _Search(logs, tuple(candidates), unnamed, always, settings, report, known, before=start.objective)
     best_named, best_unnamed = (max((s.aic_gain for s in known.ranked(start, c)), default=0.0) for c in (candidates, unnamed))
-    orders = ((), later), (unnamed, ())  # effects without a name after the others, or beside them
+    orders = ((), later), (unnamed, ())  # effects without a name after the others, or together with them
     order, other_order = reversed(orders) if best_unnamed > best_named + settings.clearly_better else orders
     begun = first.pruned(fit(logs, (*always, *begin))) if begin else start
     second = replace(first, candidates=known.copy(), progress=lambda text: None)

@@ -1,6 +1,6 @@
 """Noise model from the residuals of the full-catalogue fit, and the band of the poses.
 
-Beside poses the noise is unknown: that of the poses, differentiated, has every colour, and that of the sensor lies under it.
+Against poses the noise is unknown: that of the poses, differentiated, has every colour, and that of the sensor lies under it.
 It is estimated from what a rich model leaves: every effect of the catalogue, the nonlinear ones by their derivatives where a
 fit of them would start. An effect left out here would be taken for noise, and never be seen again.
 """
@@ -54,7 +54,7 @@ def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -
 def whitened_stretches(
     pairs: Sequence[Pair], candidates: Callable[[Pair], Sequence[Effect]], settings: BandSettings
 ) -> list[WhitenedImu]:
-    """Whitened stretches of logs; a short one beside longer ones is left out with a warning.
+    """Whitened stretches of logs; a short one among longer ones is left out with a warning.
 
     Raises:
         DataError: all are too short for a noise model.

@@ -150,7 +150,7 @@ def with_plainer_effects(logs: Sequence[WhitenedLog], base: Fit, named: Sequence
 def _plainer(effect: Effect, theta: Theta, *, poses: bool) -> Mapping[str, tuple[Sequence[int], Sequence[float]]]:
     """Effects that may stand for one: their free parameters, by index, and a start.
 
-    A clock that jumps, a gyro that lags against poses (which have a clock of their own), a drift or step of a bias beside a
+    A clock that jumps, a gyro that lags against poses (which have a clock of their own), a drift or step of a bias next to a
     temperature of the log, two gains of axes that hardly change their sign, a share that lags by as much as the motion, three
     scales as one gravity within what Earth has.
     """
@@ -217,7 +217,7 @@ def unidentified(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> It
 
 
 def for_noise(effects: Sequence[Effect]) -> list[Effect]:
-    """Effects beside which noise is measured: further steps or orders would leave too little."""
+    """Effects whose residual gives the noise: further steps or orders would leave too little."""
     return [effect for effect in effects if effect.name != LOW_PASSES[1] and effect.variant not in (SHARED, STEP, *ONCE_MORE)]
 
 

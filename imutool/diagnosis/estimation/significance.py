@@ -1,6 +1,6 @@
 """Significance of an effect: p-values, robust covariance, posterior of its onset.
 
-A fit's information holds where its white residuals are white. Beside poses they seldom are: the poses' errors come with the
+A fit's information holds where its white residuals are white. Against poses they seldom are: the poses' errors come with the
 motion and last. The sum of J^T r over a block of some seconds scatters by the real errors, and a covariance made of those
 sums ("sandwich": Liang and Zeger, Biometrika 1986) is right whatever the residuals are within a block. Few blocks
 underestimate it, for the fit went through each; the leverage is taken off (CR2: Bell and McCaffrey, Survey Methodology 2002).
@@ -78,7 +78,7 @@ def parameter_cost(like: Fit, chosen: Chosen) -> float:
 def gain_of(whole: Fit, k: int, iterations: int | None = None) -> tuple[float, float]:
     """Squares that leaving an effect out costs, at most, and those that no walk of a bias saves.
 
-    What acts several times (two drifts, three steps) may be a walk as a whole, and any of it be needed beside the rest. So
+    What acts several times (two drifts, three steps) may be a walk as a whole, and each part be needed next to the rest. So
     all of it together, with as many parameters, has to be as unlikely by chance.
     """
     gain, saved = _gain_without(whole, [k], iterations)

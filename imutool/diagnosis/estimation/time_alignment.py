@@ -276,7 +276,7 @@ def _rests(imu: Imu) -> bool:
 
 
 def _refined(real: Imu, sim: Imu, lag_s: float, settings: AlignmentSettings) -> float:
-    """Lag (s) refined by Gauss-Newton, beside any linear map of the simulated rates."""
+    """Lag (s) refined by Gauss-Newton, together with any linear map of the simulated rates."""
     t_s = seconds(real.t_ns, int(real.t_ns[0]))
     t_sim, off_s = seconds(sim.t_ns, int(real.t_ns[0]) + nanoseconds(lag_s)), 0.0
     rate = make_interp_spline(t_sim, sim.gyro, k=3)

@@ -22,7 +22,7 @@ from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.units import ASCII_UNITS, AXES, SENSORS, Sensor
 
 EXPLAINED = 0.03  # of the motion's squares: a convention leaves less, unless the mount is turned by 10 degrees besides
-EXPLAINED_AS_OTHER = 0.3  # likewise, if the other sensor shows the same axes: a large lever arm is left beside a convention
+EXPLAINED_AS_OTHER = 0.3  # likewise, if the other sensor shows the same axes: a large lever arm is left next to a convention
 UNLIKE = 0.1  # loss of correlation with the motion that another order of axes may bring: at rest no order correlates
 CONSTANT = 0.1  # of the squares of the specific force: a bias and a tilt leave less of them, a wrong convention most of gravity
 Readings = Float64[np.ndarray, "n 3"]

@@ -40,7 +40,7 @@ SOME = 0.05  # of the samples of an axis at its limit, from which it is reported
 MOVES = 5.0  # times its noise: an axis should have moved so much to be called stuck
 COPIED = 0.5  # share of a simulation's poses whose stamps the recording has, too: above, it may follow them
 DRIFTING = frozenset({"clock_skew", "clock_jump", "clock_wander"})
-KNOWN_S = 1e-3  # deviation of a clock difference, below which delays of other signals are seen beside it
+KNOWN_S = 1e-3  # deviation of a clock difference, below which delays of other signals can be seen
 BY_THEMSELVES = frozenset({"saturation", "quantization"})  # of the catalogue
 
 

@@ -103,7 +103,7 @@ def _pairs(real: Recording, motion: SmoothMotion, settings: DiagnoseSettings) ->
 def _is_followed(plain: Sequence[Pair], robust: Sequence[Pair]) -> bool:
     """Whether samples follow plain curves where these leave the robust ones.
 
-    What is left of the samples beside the robust curve is regressed on the difference of the curves: an error of a pose has a
+    The difference of the samples and the robust curve is regressed on the difference of the curves: an error of a pose has a
     slope of 0, a motion of 1. No sensor may be nearer to 0, and one has to be clearly nearer to 1.
     """
     if not plain or not robust:

@@ -147,7 +147,7 @@ def without_others(pair: SignalPair, settings: DiagnoseSettings) -> SignalPair |
 
 
 def _refuse_contradictory(state: Mapping[str, Fields], pair: SignalPair, log: str) -> None:
-    """Refuses velocities that are no rates of the positions beside them.
+    """Refuses velocities that are no rates of the positions next to them.
 
     They are compared by the way of each second: a velocity that is filtered, or late, goes the same way but for a small part.
 
@@ -170,7 +170,7 @@ def _refuse_contradictory(state: Mapping[str, Fields], pair: SignalPair, log: st
     share, by_velocity, by_position, name = max(contradictions, default=(0.0, 0.0, 0.0, ""))
     if share > CONTRADICTS:
         raise DataError(
-            f"the velocity beside {name} is not the rate of the position in the {log}:"
+            f"the velocity next to {name} is not the rate of the position in the {log}:"
             f" {by_velocity:.3g} rad a second by the velocity, {by_position:.3g} by the position",
             where=name,
             expected="velocities that are the rates of the positions",

@@ -103,7 +103,7 @@ def in_radians(pair: SignalPair) -> tuple[SignalPair, str]:
     """Efforts of an arm with its angles in radians, where a log has degrees.
 
     A hinge of an arm turns less than twice round. Simulated degrees are known by the efforts, which follow from the angles in
-    radians alone; recorded ones by their size beside the simulated.
+    radians alone; recorded ones by their size relative to the simulated.
     """
     states, changed, settings = [pair.state, pair.sim_state], list[str](), DiagnoseSettings()
     far = [pair.kind == "efforts" and max(map(_size, _angles(state)), default=0.0) > TURNED for state in states]

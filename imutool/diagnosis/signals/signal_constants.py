@@ -1,7 +1,7 @@
 """Constants of a signal in every fit: its zero, its digits, torque constants of currents.
 
 Where efforts are motor currents, each joint has a gain. Currents differ from torques by a large factor of their own at each
-joint. Beside such a misfit all else is small, so that the factors have to be known before effects are searched for. A heavy
+joint. Next to such a misfit all else is small, so that the factors have to be known before effects are searched for. A heavy
 load makes efforts larger as well, and so does a controller that asks for what a limit keeps back; efforts that oscillate and
 act late are unlike what a motion needs. All are compared.
 """

@@ -199,7 +199,7 @@ def _selected(prepared: _Prepared) -> Selection:
 
 
 def _beside_stiction(prepared: _Prepared, found: Selection, driven: Sequence[Effect]) -> tuple[Selection, list[Effect]] | None:
-    """Selection beside joints that friction holds at rest, and its candidates; None where it is no better.
+    """Selection with joints that friction holds at rest, and its candidates; None where it is no better.
 
     What a joint's rest leaves looks like a delay, for the joint turns when its effort does not.
     """

@@ -261,7 +261,7 @@ def _found(tree: Tree, form: Format) -> Reflected | None:
 
 
 def _pose(tree: Tree, form: Format) -> Reflected | None:
-    """First position with a quaternion beside it in the tree of a message's fields."""
+    """First position with a quaternion next to it in the tree of a message's fields."""
     fields = [*fields_of(tree)]
     for path, name, node in fields:
         if not (isinstance(node, Mapping) and re.fullmatch(ORIENTATION, name)):

@@ -63,7 +63,7 @@ _FIELDS = {
     ),
 }
 
-# REP-2011 hashes of the definitions, as ROS 2 records them beside a channel; a test recomputes them with rosbags.
+# REP-2011 hashes of the definitions, as ROS 2 records them with a channel; a test recomputes them with rosbags.
 TYPE_HASHES = {
     IMU: "RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b",
     POSE: "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",

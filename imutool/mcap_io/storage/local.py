@@ -1,6 +1,6 @@
 """Write local files, devices and pipes; remove temporary files of killed processes.
 
-A file is written as `.NAME.PID.HEX.partial` beside its place. HEX says the machine (and container), its boot, the start of
+A file is written as `.NAME.PID.HEX.partial` next to its place. HEX says the machine (and container), its boot, the start of
 the process, and a random number, so that a later run can tell whose file it is. It removes one if and only if
 
 - this machine and container wrote it, and
@@ -52,7 +52,7 @@ def removed_if_empty(folder: Path) -> Iterator[None]:
 
 
 class LocalFile:
-    """File under its temporary name beside its place."""
+    """File under its temporary name, next to its place."""
 
     file: BinaryIO
 
@@ -151,7 +151,7 @@ def _open_number(path: Path) -> int | None:
 
 
 def temporary_path(path: Path) -> Path:
-    """Path of a temporary file or folder beside a place, marked with machine, boot and process."""
+    """Path of a temporary file or folder next to a place, marked with machine, boot and process."""
     place = path.absolute() if not path.name else path  # "." has no name of its own
     mark = f"{_machine()}{_boot()}{_start(os.getpid()) or '0' * MARK_PART}{secrets.token_hex(MARK_PART // 2)}"
     return place.with_name(f".{_short(place.name)}.{os.getpid()}.{mark}.partial")

@@ -23,7 +23,7 @@ def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     """Times at which a step of the offset explains most of the gyro's residual, to first order, by part.
 
     An offset tau adds tau d omega/dt, so that sums up to each sample and from it on tell what any jump would bring. The last of
-    them are steps on a trend: beside a clock that also runs fast, two offsets do not show when it jumps.
+    them are steps on a trend: with a clock that also runs fast, two offsets do not show when it jumps.
     """
     error, _ = residual(motion, samples)
     slope = np.gradient(motion.sample(samples.stamp_s, samples.stamp_s).gyro, samples.stamp_s, axis=0)

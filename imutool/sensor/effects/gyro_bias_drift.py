@@ -55,7 +55,7 @@ def warm_up(sensor: Sensor, unit: str, plausible: float) -> Effect:
 
 
 def within(effects: Sequence[Effect], end_s: float) -> Iterator[Effect]:
-    """Effects in a log that ends then, with a second and a steady drift beside each warm-up.
+    """Effects in a log that ends then, with a second and a steady drift next to each warm-up.
 
     A warm-up is fitted by what the log reaches of it. Of a time constant far beyond the log only the slope shows, A / tau: tau
     is a day there, and as unsure as its prior.

@@ -18,7 +18,7 @@ from imutool.sensor.effect import ONCE_MORE, Effect, Parameter, Stage, Theta, ea
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import Sensor
 
-TREND_DEGREES = (0, 2)  # of time, beside which a step is looked for: a bias that also drifts hides when it steps
+TREND_DEGREES = (0, 2)  # of time, fitted together with a step: a bias that also drifts hides when it steps
 EDGE_S = 1.0  # of the log at both ends, where a few wrong samples look like a step
 INDEPENDENT = 1e-9  # relative to the largest: smaller singular values are combinations of others
 
@@ -55,7 +55,7 @@ def repeated(effects: Sequence[Effect]) -> Iterator[Effect]:
 
 
 def _starts(sensor: int, before: int, motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
-    """The likeliest step with so many likelier ones before it, beside each trend."""
+    """The likeliest step with so many likelier ones before it, with each trend."""
     error, t_s = residual(motion, samples)[sensor], samples.stamp_s
     others = followed(motion.sample(t_s, t_s))
     trends = (np.vander((t_s - t_s[0]) / np.ptp(t_s), degree + 1) for degree in TREND_DEGREES)
@@ -79,7 +79,7 @@ def likeliest_onset(
 ) -> Theta:
     """Sizes by axis, then the time, of the onset that explains most of an error.
 
-    A constant sets in, or a column of `setting_in` for each axis, between two samples, beside some columns and so many
+    A constant sets in, or a column of `setting_in` for each axis, between two samples, together with some columns and so many
     likelier constants. Each axis counts by what is left there. In least squares a further column gains (left' x)² / x' x, both
     less their projection on the others (Frisch and Waugh, Econometrica 1933); for all columns that set in at one time these
     are sums from that time on.
@@ -102,7 +102,7 @@ def _largest(
     basis: Float64[np.ndarray, "n q"],
     columns: Float64[np.ndarray, "n k"],
 ) -> tuple[Float64[np.ndarray, "3"], int]:
-    """Size of what explains most by setting in, beside orthonormal columns, and the sample before it."""
+    """Size of what explains most by setting in, after orthonormal columns, and the sample before it."""
     rest = error - basis @ (basis.T @ error)
     own = [_from_on(x**2) - (_from_on(basis * x[:, None]) ** 2).sum(axis=1) for x in columns.T]
     minimum = np.maximum((columns**2).mean(axis=0), np.finfo(np.float64).tiny)

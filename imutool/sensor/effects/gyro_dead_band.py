@@ -30,7 +30,7 @@ def _forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
 def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     """The width below which zero explains the samples better than the rate, by most squares.
 
-    Beside a dead zone that is twice its width.
+    With a dead zone that is twice its width.
     """
     error, _ = residual(motion, samples)
     ideal = motion.sample(samples.stamp_s, samples.stamp_s).gyro

@@ -12,7 +12,7 @@ from imutool.sensor.effects.gyro_bias_step import followed, likeliest_onset
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import SENSORS, Sensor
 
-STEP = "step"  # variant of a scale that sets in at one time, also beside the scale of the whole log
+STEP = "step"  # variant of a scale that sets in at one time, also together with the scale of the whole log
 T_STEP = Parameter("t_step", "s", 30.0, begins=True)
 
 
@@ -42,7 +42,7 @@ def _from_one_time_on(whole: Effect) -> Effect:
         return samples.with_added(sensor, on * theta[:3] * getattr(samples, sensor))
 
     def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
-        """The likeliest time at which the scale changes, beside what most other errors follow."""
+        """The likeliest time at which the scale changes, after what most other errors follow."""
         ideal, t_s = motion.sample(samples.stamp_s, samples.stamp_s), samples.stamp_s
         error = residual(motion, samples)[SENSORS.index(sensor)]
         others = np.column_stack([np.ones(len(t_s)), followed(ideal)])

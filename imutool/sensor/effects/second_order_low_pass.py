@@ -1,6 +1,6 @@
 """Second-order low-pass on both sensors, H(s) = w_c² / (s² + 2 zeta w_c s + w_c²).
 
-Most MEMS sensors have one (BMI160 data sheet, 2.4.3: "second order Butterworth"). Beside its delay of 2 zeta / w_c it keeps the
+Most MEMS sensors have one (BMI160 data sheet, 2.4.3: "second order Butterworth"). It delays by 2 zeta / w_c, keeps the
 amplitude of slow motion, which a first order does not, and delays fast motion more.
 """
 
@@ -48,7 +48,7 @@ def _design(theta: Theta) -> Design:
 @lru_cache(maxsize=64)
 def _second_order(a: float, zeta: float) -> Filter:
     """H for w_c of `a` rad a sample."""
-    faster = zeta + cmath.sqrt(zeta**2 - 1.0)  # the poles' product is one, whose difference would cancel beside a large damping
+    faster = zeta + cmath.sqrt(zeta**2 - 1.0)  # the poles' product is one, whose difference would cancel at a large damping
     pole, other = cmath.exp(-a / faster), cmath.exp(-a * faster)
     s = 1j * OMEGA
     return Filter.of(a**2 / (s**2 + 2.0 * zeta * a * s + a**2), np.array([1.0, -(pole + other).real, (pole * other).real]))

@@ -46,7 +46,7 @@ def line_p_value(samples: Float64[np.ndarray, "n k"], rate_hz: float, f_hz: floa
     from scipy.stats import gamma
 
     frequency, power = periodogram(samples, rate_hz, "hann", axis=0)
-    side, half = ABOUT // FINER // 2, ABOUT // FINER // 4 + 2  # frequencies beside it, and to their middle
+    side, half = ABOUT // FINER // 2, ABOUT // FINER // 4 + 2  # frequencies next to it, and to their middle
     medians = np.pad(median_filter(power, (side, 1)), ((half, half), (0, 0)), "edge")
     beside = np.maximum(medians[: -2 * half], medians[2 * half :])  # where a motion ends, one side is far quieter
     level = beside / np.log(2.0) + np.finfo(np.float64).tiny  # mean of what is exponential

@@ -59,7 +59,7 @@ class _Rotor:
 def with_extent(effect: Effect) -> Effect:
     """A payload with an inertia about its own centre; any other effect as it is.
 
-    One joint does not tell it from a rotor's. Beside what is not found yet, it takes what is no load's: it is fitted last.
+    One joint does not tell it from a rotor's. While effects are missing, it takes what is no load's: it is fitted last.
     """
     if not isinstance(effect.forward, _Payload) or effect.forward.dynamics.joints == 1:
         return effect

@@ -51,7 +51,7 @@ def with_stiction(effect: Effect) -> Effect:
 
     At rest the force is what the command leaves over, up to Coulomb's and Stribeck's level together (eq. 3 of the survey):
     sliding alone shows the levels. It follows the recording there, so that only sliding may bring it in; what else acts is then
-    searched for beside it.
+    searched for together with it.
     """
     forward = effect.forward
     if not isinstance(forward, _Friction) or forward.kind == "viscous" or forward.holds:

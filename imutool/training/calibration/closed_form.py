@@ -167,7 +167,7 @@ def _apart(own: Float[Tensor, "logs o"], turns: slice) -> Float[Tensor, "logs o"
 def _matrix_by_scatter(
     sensor: Sensor, sets: Iterable[_Linearised], W: Float[Tensor, "3 3"], own: Float[Tensor, "logs o"]
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "9 9"]]:
-    """W and its covariance with errors as large as the logs scatter, beside nuisances that are as wide as the logs show."""
+    """W and its covariance with errors as large as the logs scatter, with nuisances as wide as the logs show."""
     sums = [sums_by_log(torch.cat([s.by_matrix, s.by_own], dim=2), s.e, s.weight, s.log, len(own)) for s in sets]
     H, g = (torch.stack([parts[k] for parts in sums]).sum(0) for k in (0, 1))
     theta, prior = W.flatten(), torch.full((9,), W_PRIOR**-2.0).to(W)

@@ -4,7 +4,7 @@ The curve is linear in W and V. A descent on batches ends about their minimum, w
 combinations that the motion hardly shows to and fro. Least squares have one minimum, and features that were drawn predict
 left-out logs better than features that were descended to (docs/measurements/left-out-logs.md). They are the least squares of
 named effects (`imutool.training.calibration.normal_equations`): windows up to 40 s, each log's own rest bias and nuisances
-beside the shared weights, errors as large as the logs scatter. V is zero where it does not predict left-out logs surely better
+next to the shared weights, errors as large as the logs scatter. V is zero where it does not predict left-out logs surely better
 than W alone.
 
 Source of features that are drawn: Rahimi and Recht, "Random features for large-scale kernel machines", NIPS 2007.

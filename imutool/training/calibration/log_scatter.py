@@ -94,7 +94,7 @@ def shared_by_scatter(
     """Parameters that logs share, with their covariance, as the logs scatter (Birge's ratio).
 
     `logs` are losses about theta. Each log alone is compared with the others: posterior means of one prior differ by
-    C + D - CD - DC, in units of the prior. The ratio of their squares to this is the size of a log's errors, beside
+    C + D - CD - DC, in units of the prior. The ratio of their squares to this is the size of a log's errors, next to
     `USUAL_SQUARES` squares of the stated size. A log on its own has the stated size. Errors of parameters that are missing
     count, too: what only a part of them shows stays near its prior.
     """

@@ -69,7 +69,7 @@ def log(d: Diagnosis, to: rr.RecordingStream) -> None:
 
 
 def blueprint(d: Diagnosis) -> rrb.Blueprint:
-    """Layout: a tab for each log with residuals, samples and events, beside the report.
+    """Layout: a tab for each log with residuals, samples and events, next to the report.
 
     Raises:
         ConfigError: Rerun is not installed.

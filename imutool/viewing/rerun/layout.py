@@ -34,7 +34,7 @@ def blueprint(logs: Sequence[RunData], *, source: bool = True, root: Scope = ())
 
 
 def live_blueprint(scopes: Mapping[str, Scope], boxes: Mapping[str, Box] | None = None) -> rrb.Blueprint:
-    """Layout of a live view: paths beside signals and biases, a tab for each of several IMUs.
+    """Layout of a live view: paths next to signals and biases, a tab for each of several IMUs.
 
     Args:
         scopes: the scope of each IMU topic.

@@ -42,7 +42,7 @@ def show(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = N
     except ConfigError as error:
         trouble = as_sentence(error)
     saved = scene.save(logs, source=source, overwrite=overwrite)
-    return replace(saved, said=f"{trouble}{saved.said}, or use a browser: imutool view --web")
+    return replace(saved, said=f"{trouble}{saved.said}, or use a browser: imutool view LOG --web")
 
 
 def open_viewer(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = None) -> Output:

@@ -72,7 +72,7 @@ class StreamFit:
         self._judge(self.first, force=self.force)
 
     def add(self, sample: Sample) -> None:
-        """Keep a sample; at some times judge all beside the stream."""
+        """Keep a sample; at some times a thread judges all of them."""
         seconds = (sample.stamp_ns - int(self.first.t_ns[0])) * 1e-9
         if 0.0 <= seconds < CHECKED_S:
             self._kept.append(sample)

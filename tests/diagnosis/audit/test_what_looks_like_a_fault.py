@@ -67,6 +67,18 @@ def test_digits_are_no_noise_density() -> None:
     assert {fault.fault for fault in faults} == {"digits_absent"}
 
 
+def test_a_noise_that_contradicts_sheet_and_recording_is_one_fault() -> None:
+    sim, real = np.array([1.0, 3.0])[:, None, None] * np.random.default_rng(3).normal(size=(2, 6000, 6))
+    t_ns = (np.arange(6000) * 1e7).astype(np.int64)
+    references = [
+        Expected(np.full(6, 0.2), np.full(6, np.nan)),
+        Expected.of_recording(Imu(t_ns, real[:, :3].copy(), real[:, 3:].copy())),
+    ]
+    faults, _ = noise_faults(Imu(t_ns, sim[:, :3].copy(), sim[:, 3:].copy()), sim, references)
+    assert [(fault.fault, fault.signal) for fault in faults] == [("noise_density", "gyro"), ("noise_density", "accel")]
+    assert [fault.parameters["expected"].value for fault in faults] == pytest.approx([3.0, 3.0], rel=0.05)
+
+
 def test_a_frame_is_told_by_what_the_poses_follow() -> None:
     """A shaking above their band is as large as gravity, and a body that hardly leans shows its frame by a tenth of it."""
     rng, period_s = np.random.default_rng(3), 1.0 / 200.0

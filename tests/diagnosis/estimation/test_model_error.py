@@ -1,4 +1,4 @@
-"""What may be the error of a model is no finding: a clock beside a far larger effect, a scale or an arm beside a low-pass."""
+"""What may be the error of a model is no finding: a clock next to a far larger effect, a scale or an arm next to a low-pass."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_an_effect_alone_is_told() -> None:
     assert not below_model_error({}, SETTINGS, denoised=False, poses=False)
 
 
-# ── beside a low-pass ──
+# ── next to a low-pass ──
 
 
 def low_passed(seed: int, vibrates_hz: tuple[float, float], scale: float = 1.0, duration_s: float = DURATION_S) -> Selection:
@@ -208,7 +208,7 @@ def test_the_low_pass_of_a_remark_is_said_to_be_of_the_simulations_noise_if_none
 
 
 def test_a_filter_that_only_fits_with_an_endless_damping_is_of_first_order() -> None:
-    """Its two parameters have one value together: what came in beside them was chosen by the last bits of a processor."""
+    """Its two parameters have one value together: what came in next to them was chosen by the last bits of a processor."""
     (found,) = low_passed(0, (230.0, 270.0)).selected
     assert found.effect.key == "low_pass:accel"
 

@@ -1,4 +1,4 @@
-"""The right effects and no others: none on noise, one, two, the channel that drives beside its like, none by a wrong name."""
+"""The right effects and no others: none on noise, one, two, the channel that drives next to its like, none by a wrong name."""
 
 from __future__ import annotations
 
@@ -208,7 +208,7 @@ def test_a_bias_may_settle_with_two_time_constants() -> None:
 
 @pytest.mark.parametrize(("corner_hz", "seed"), [(0.05, 2), (0.1, 5), (0.3, 7), (1.2, 3)])
 def test_a_bias_that_walks_steps_and_drifts_no_number_of_times(corner_hz: float, seed: int) -> None:
-    """Of two drifts that nearly cancel each is needed beside the other, and both together are a walk."""
+    """Of two drifts that nearly cancel each is needed next to the other, and both together are a walk."""
     steps = 2.0 * np.pi * corner_hz / planted.RATE_HZ * planted.noise(len(planted.clock(WALK_S)), seed + 1000)
     walk = np.cumsum(steps, axis=0)
     assert names(several_times(planted.pair(planted.rich(seed + 1, WALK_S), {}, seed, added=walk))) == []
@@ -777,7 +777,7 @@ def test_each_sensor_has_its_own_filter(
 
 
 def test_a_gyro_is_not_ahead_of_a_slow_accelerometer_but_the_clock_is() -> None:
-    """Of slow motion a faster filter beside a gyro that looks ahead leaves as little, and no filter looks ahead."""
+    """Of slow motion a faster filter next to a gyro that looks ahead leaves as little, and no filter looks ahead."""
     felt, slow = trembling(8.0), ("second_order_low_pass", [20.0, 0.7])
     logs = [planted.weighed(through(felt, ("clock_skew", [0.0]), slow, -0.004))]
     delay, filtered = ([of for of in planted.catalogue() if of.key == key] for key in ("gyro_delay", f"{slow[0]}:accel"))
@@ -854,7 +854,7 @@ def test_a_dead_zone_whose_faster_readings_lose_its_width_is_a_dead_band() -> No
 
 
 def test_a_low_pass_above_what_samples_can_show_is_told_by_its_delay() -> None:
-    """Beside an exact simulation; what smoothed poses say ends six times above their band, and beyond it is a delay."""
+    """Against an exact simulation; what smoothed poses say ends six times above their band, and beyond it is a delay."""
     pair = planted.pair(planted.shaken(), {"low_pass": [48.0]})
     found = asked(pair, beyond=False)
     assert names(found) == ["low_pass"]

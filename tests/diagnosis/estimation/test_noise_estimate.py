@@ -1,4 +1,4 @@
-"""Noise beside poses is what poses and sensor have, not what an effect does; a band ends where the poses' own errors begin."""
+"""Noise against poses is what poses and sensor have, not what an effect does; a band ends where the poses' own errors begin."""
 
 from __future__ import annotations
 

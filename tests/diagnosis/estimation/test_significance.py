@@ -77,7 +77,7 @@ def test_poses_that_err_make_a_scale_as_unsure_as_they_dilute_it() -> None:
 
 
 def test_beside_poses_effects_without_a_name_must_not_cancel_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each gains much beside the other, and both together lose; a named effect is no part of it."""
+    """Each gains much next to the other, and both together lose; a named effect is no part of it."""
     names = ("gyro_scale", "accel_scale", "gyro_quadratic")
     pair = planted.pair(FELT)
     beside = fit(

@@ -1,4 +1,4 @@
-"""A recording beside a simulation or its own truth: one clock, no noise of the simulation's, tests apart from fits."""
+"""A recording against a simulation or its own truth: one clock, no noise of the simulation's, tests apart from fits."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_white_noise_alone_goes_almost_altogether() -> None:
     assert rms(wiener_filter(noise[:, None], 100.0)) < 0.05
 
 
-# ── beside a simulation ──
+# ── against a simulation ──
 
 
 @pytest.mark.parametrize("sim_hz", [100.0, 137.0, 200.0, 400.0])

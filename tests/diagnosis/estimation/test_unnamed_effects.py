@@ -199,7 +199,7 @@ def test_a_curve_follows_the_range_of_a_robot_that_stands_most_of_the_time() -> 
 
 @pytest.mark.parametrize(("gain", "poses", "shrinks"), [(-0.09, True, True), (-0.01, True, False), (-0.09, False, False)])
 def test_a_term_that_takes_away_the_motion_of_poses_is_their_noise(gain: float, poses: bool, shrinks: bool) -> None:
-    """Beside gravity of 9.81 m/s² along z, a rate times the force is a scale of ten times the gain."""
+    """Next to gravity of 9.81 m/s² along z, a rate times the force is a scale of ten times the gain."""
     pair = replace(planted.pair(planted.planar()), band_hz=6.0 if poses else None)
     (term,) = (one for one in unnamed.terms(unnamed.like([pair])) if one.variant == "gyro.z:omega_z f_z")
     assert unnamed.takes_noise(term, np.array([gain]), [planted.weighed(pair)]) == shrinks

@@ -93,7 +93,7 @@ def test_rows_are_filtered_as_the_books_filters_do(banded: bool) -> None:
         np.testing.assert_allclose(got, lfilter(w.filters[axis], [w.std[axis]], slow), atol=1e-12)
 
 
-# ── beside an exact simulation ──
+# ── against an exact simulation ──
 
 
 @pytest.mark.parametrize("seed", range(3))

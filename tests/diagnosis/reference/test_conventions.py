@@ -1,4 +1,4 @@
-"""A wrong unit and swapped axes beside a simulation of the same motion have their own names."""
+"""A wrong unit and swapped axes against a simulation of the same motion have their own names."""
 
 from __future__ import annotations
 

@@ -224,7 +224,7 @@ def test_signals_with_the_same_remark_share_it(tmp_path: Path) -> None:
 def test_units_of_either_log_are_brought_to_the_message_or_to_the_simulation(
     kind: str, size: float, real: float, sim: float, by: float
 ) -> None:
-    """Also beside a gain of 1.15, as no sensor's own gain is a thousand."""
+    """Also next to a gain of 1.15, as no sensor's own gain is a thousand."""
     values = (size + 0.1 * size * wave(1))[:, None]
     t_ns = (T * 1e9).astype(np.int64)
     given = SignalPair.of_fields(Fields(t_ns, 1.15 * real * values[:, 0]), Fields(t_ns, sim * values[:, 0]), "/x.y")
@@ -309,7 +309,7 @@ def json_log(path: Path, messages: Sequence[dict[str, object]]) -> None:
 
 
 def test_a_field_and_an_air_pressure_are_known_in_any_message_by_their_names_and_sizes(tmp_path: Path) -> None:
-    """Gauss and hectopascal; a pump, a thermometer beside the barometer and a spectrum are none."""
+    """Gauss and hectopascal; a pump, a thermometer next to the barometer and a spectrum are none."""
     turned = np.stack([wave(1), wave(2), 2.0 + wave(3)], axis=1)
     field = 0.5 * turned / np.linalg.norm(turned, axis=1, keepdims=True)
     for name, gain in (("real", 1.1), ("sim", 1.0)):

@@ -1,4 +1,4 @@
-"""Robots from logs to names: an arm in MuJoCo, a vehicle on wheels, one in flight, each beside a poorer simulation."""
+"""Robots from logs to names: an arm in MuJoCo, a vehicle on wheels, one in flight, each against a poorer simulation."""
 
 from __future__ import annotations
 

@@ -264,7 +264,7 @@ def test_the_start_of_a_lag_is_unknown_and_makes_no_drift(seed: int) -> None:
 
 
 def test_what_drives_a_field_has_a_direction() -> None:
-    """The current of a motor beside a magnetometer: one lag, a gain for each axis."""
+    """The current of a motor next to a magnetometer: one lag, a gain for each axis."""
     t, rng, gains = 3.0 + np.arange(3000) / 50.0, np.random.default_rng(1), np.array([2e-7, -1e-7, 3e-7])
     field = 4e-5 * np.stack([Motion(k)(t) for k in range(3)], axis=1)
     current = 5.0 + Motion(9)(t)

@@ -231,7 +231,7 @@ def test_nuisances_are_as_wide_as_logs_scatter() -> None:
 
 
 def test_an_estimate_that_hides_the_errors_of_the_imu_counts_less_than_a_truth(flights: list[Recording], planted: Make) -> None:
-    """Poses made with the IMU follow it: beside them it seems to have no matrix, and their small residual is no merit."""
+    """Poses made with the IMU follow it: next to them it seems to have no matrix, and their small residual is no merit."""
     small, none = ({sensor: size * W[sensor] for sensor in W} for size in (0.1, 0.0))
     no_rest = {sensor: np.zeros(3) for sensor in W}
     true, hidden = planted(flights[0], small, no_rest, noise=NOISE["gyro"]), planted(flights[1], none, no_rest)

@@ -62,7 +62,7 @@ def refused(logs: list[RunData]) -> float:
 def test_without_a_display_it_saves_at_once_and_says_how_to_open(data: RunData, here: Path, no_display: None) -> None:
     said = viewer.show([data]).said
     assert said == (
-        "There is no display here. Saved flight_3.rrd. Open with: rerun flight_3.rrd, or use a browser: imutool view --web"
+        "There is no display here. Saved flight_3.rrd. Open with: rerun flight_3.rrd, or use a browser: imutool view LOG --web"
     )
     assert entities(here / "flight_3.rrd") >= {"/world/raw/path"}
 

@@ -17,7 +17,7 @@ from imutool.sensor.effects.mount_resonance import DAMPER
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import SENSORS
 
-HIGHER = 0, 4  # orders that a diagnosis tries, beside the first and the second
+HIGHER = 0, 4  # orders that a diagnosis tries, in addition to the first and the second
 WIDTHS = 0.3, 1.0  # of the motion's standard deviation, from where the fit of a share starts
 
 

@@ -219,7 +219,7 @@ def _sensors(chosen: Chosen) -> list[tuple[str, ...]]:
 
 
 def _allowed(base: Fit, k: int, named: Sequence[Effect]) -> list[Effect]:
-    """Effects that may act beside all others but one."""
+    """Effects that may act together with all others but one."""
     others = (*base.chosen[:k], *base.chosen[k + 1 :])
     return [of for of in named if of.name not in LOW_PASSES or not any(exclude_each_other(of, e) for e, _ in others)]
 

@@ -1,4 +1,4 @@
-"""Errors of models: how small an effect beside a far larger one may be its model's error."""
+"""Errors of models: how small an effect may be the error of the model of a far larger one."""
 
 from __future__ import annotations
 
@@ -103,8 +103,8 @@ def is_part_of_misfit(effect: Effect, gain: float, found: Fit) -> bool:
 def is_swing_of_motion(effect: Effect, found: Fit) -> bool:
     """Whether a step of a bias is no more than what follows the motion around it.
 
-    It is asked beside a misfit that has no name. On three seconds to each side the step has to explain more than chance (F)
-    beside a constant, everything that a misfit follows (`followed`), and both times the time, as gains that change (Chow,
+    It is asked where a misfit has no name. On three seconds to each side the step has to explain more than chance (F)
+    after a constant, everything that a misfit follows (`followed`), and both times the time, as gains that change (Chow,
     Econometrica 28, 1960).
     """
     settings = found.logs[0].pair.settings.search

@@ -17,8 +17,8 @@ from imutool.diagnosis.estimation.whitening import WhitenedLog
 def first_refuted(fitted: Fit, first: int) -> int:
     """Index of the first effect that unseen blocks refute; the number of effects if none is.
 
-    Blocks that this fit has not seen, and those that a fit of the others has not. Beside poses effects without a name have to
-    stand together, too: two that cancel gain much beside each other. What sets in once changes the constant, and all unseen
+    Blocks that this fit has not seen, and those that a fit of the others has not. Against poses effects without a name have to
+    stand together, too: two that cancel gain much together. What sets in once changes the constant, and all unseen
     blocks may lie behind it: the constant is that of the blocks that were fitted.
     """
     (other, hidden), exact = _fit_of_others(fitted), all(log.pair.exact for log in fitted.logs)

@@ -1,4 +1,4 @@
-"""Verdicts on chosen effects: on all rows, on unseen time, beside errors of models."""
+"""Verdicts on chosen effects: on all rows, on unseen time, and against errors of models."""
 
 from __future__ import annotations
 
