@@ -26,7 +26,7 @@ from imutool.inertial.aids import WHEELS, Aids, Odometry
 from imutool.inertial.preintegration import hat
 from imutool.inertial.scoring.alignment import align
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
-from imutool.log_info.convention_report import convention_summary
+from imutool.log_info.imu_motion import motion_of
 from imutool.log_info.pose_coverage import coverage
 from imutool.log_info.pose_imu_rotation import agreement, motion_warnings, unlike
 from imutool.mcap_io.codec.schemas import MESSAGE_TWISTS, TF
@@ -94,7 +94,7 @@ def _on_clock(poses: Poses, imu: Imu, name: str) -> tuple[Poses, float]:
     slow = of_poses(name, poses, WHEELS)
     if slow is None:
         return poses, 0.0
-    delay = pose_delay(convention_summary(imu, slow).motion, slow)
+    delay = pose_delay(motion_of(imu).motion, slow)
     if delay is not None and delay.step is not None:
         before, after, _ = delay.step
         what = f"{name} is first {lateness(before)}, then {lateness(after)}, by the gyro"
