@@ -42,11 +42,6 @@ def sequences(source: Path) -> list[Sequence]:
     return find_files(source, (".bin", ".log"), lambda start: start.startswith(starts))
 
 
-def recognises(sequence: Sequence) -> bool:
-    """Whether a sequence is a DataFlash log: always, as only these are listed."""
-    return True
-
-
 def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     """Message log of a DataFlash log.
 

@@ -51,11 +51,6 @@ def _logs(folder: Path) -> list[Sequence]:
     return find_files(folder, (".mcap",), lambda start: start.startswith(MAGIC))
 
 
-def recognises(sequence: Sequence) -> bool:
-    """Whether a sequence is an MCAP log: always, as only logs are listed."""
-    return True
-
-
 def as_defined(topic: MessageTopic) -> MessageTopic:
     """The topic with the definition that the log has."""
     return topic

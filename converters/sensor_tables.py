@@ -81,11 +81,6 @@ def _in_zip(path: Path) -> list[Sequence]:
     return []
 
 
-def recognises(sequence: Sequence) -> bool:
-    """Whether a sequence has such tables: always, as only these are listed."""
-    return True
-
-
 def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     """Message log of the tables.
 

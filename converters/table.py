@@ -71,11 +71,6 @@ def sequences(source: Path) -> list[Sequence]:
     return recordings_in(Sequence(name(Path(table_name(source))), source)) if kind_of(head(source), source) else []
 
 
-def recognises(sequence: Sequence) -> bool:
-    """Whether a sequence is a table: always, as only tables are listed."""
-    return True
-
-
 def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Mapping[str, Any] | None = None) -> MessageLog:
     """Message log of a table, by the map file or by the names of its columns.
 

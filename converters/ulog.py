@@ -43,11 +43,6 @@ def sequences(source: Path) -> list[Sequence]:
     return find_files(source, (".ulg", ".ulge"), lambda start: start.startswith((MAGIC, ENCRYPTED)))
 
 
-def recognises(sequence: Sequence) -> bool:
-    """Whether a sequence is a ULog: always, as only ULogs are listed."""
-    return True
-
-
 def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     """Message log of a ULog.
 
