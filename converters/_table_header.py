@@ -79,8 +79,7 @@ def _lacks_first(names: list[str], first: list[str]) -> bool:
     if not all(names) or any(map(is_number, names)) or not all(map(is_number, first)) or len(first) < 3:
         return False
     steps = {round(float(b) - float(a), 9) for a, b in pairwise(text.replace(",", ".") for text in first)}
-    named_time = any(map(is_named_time, names))
-    return steps == {1.0} if named_time else min(steps) > 0.0
+    return steps == {1.0} if any(map(is_named_time, names)) else min(steps) > 0.0
 
 
 def _are_units(texts: list[str]) -> bool:

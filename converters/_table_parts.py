@@ -251,6 +251,5 @@ def _grouped(columns: Columns, length: int, sensors: Labels) -> Columns:
     for code in dict.fromkeys(codes.tolist()):
         rows = np.flatnonzero(codes == code)
         label = "_".join(str(texts[rows[0]]) for texts in sensors.values())
-        part = _with_rows(replace(renamed(columns, names), labels={}), {length: rows})
-        whole.take(label, part, label)
+        whole.take(label, _with_rows(replace(renamed(columns, names), labels={}), {length: rows}), label)
     return whole

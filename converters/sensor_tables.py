@@ -213,8 +213,8 @@ def _acceleration(
             raise DataError(f"{tables[named]} has no gravity in it, and no other acceleration is there", where=where, fix=FIX)
         return t_ns, accel, (named,)
     other_ns, gravity = _vector(files, tables["gravity"], clock, where, remarks)
-    there = interpolate((t_ns - t_ns[0]).astype(float), (other_ns - t_ns[0]).astype(float), gravity)
-    return t_ns, accel + there, (named, "gravity")
+    steady = interpolate((t_ns - t_ns[0]).astype(float), (other_ns - t_ns[0]).astype(float), gravity)
+    return t_ns, accel + steady, (named, "gravity")
 
 
 def _is_ios(files: _Files) -> bool:

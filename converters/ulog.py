@@ -97,8 +97,7 @@ def _open(path: Path) -> Any:
     pyulog = required("pyulog", "ulog", where=path, user="reading ULogs")
     if head(path, len(ENCRYPTED)) == ENCRYPTED:
         raise DataError("is encrypted", where=path, fix="Decrypt it with PX4's Tools/decrypt_ulog.py first")
-    printing = logging.getLogger("pyulog")
-    printing.setLevel(logging.ERROR)
+    logging.getLogger("pyulog").setLevel(logging.ERROR)
     try:
         # pyulog leaves a file that it refuses open, and prints where our reports go
         with _FiniteFile(FileIO(path)) as file, redirect_stdout(StringIO()):

@@ -248,8 +248,7 @@ class _Forces(NamedTuple):
 def _force_at_poses(step: Int64[np.ndarray, " m"], accel: Float64[np.ndarray, "m 3"], start_ns: int, truth: Truth) -> _Forces:
     at_ns, q_wb, a_w = force_in_world(truth)
     use, first_s, _ = usable(at_ns, at_ns + 1, start_ns, step)
-    f = interpolate(first_s, STEP_S * (step + 0.5), accel)
-    return _Forces(first_s, q_wb[use], a_w[use], f)
+    return _Forces(first_s, q_wb[use], a_w[use], interpolate(first_s, STEP_S * (step + 0.5), accel))
 
 
 def _mean_vertical(forces: _Forces) -> float | None:

@@ -209,8 +209,7 @@ def _top_power(parts: Parts, settings: WienerSettings) -> Float64[np.ndarray, " 
 
 def _apart(shared: Bool[np.ndarray, "f ..."], settings: WienerSettings) -> Bool[np.ndarray, "f ..."]:
     """Frequencies away from those that are shared."""
-    near = maximum_filter1d(shared, 2 * APART * settings.short_time_parts + 1, axis=0, mode="nearest")
-    return np.asarray(~near)
+    return np.asarray(~maximum_filter1d(shared, 2 * APART * settings.short_time_parts + 1, axis=0, mode="nearest"))
 
 
 def _shared(

@@ -96,8 +96,7 @@ def _poses(log: LogWriter, recording: Recording) -> list[Series]:
     found: list[Series] = []
     for which, (topic, poses) in enumerate(recording.truths.items()):
         t_ns, columns = poses.t_ns, (poses.t_ns, poses.p_wb, poses.q_wb_wxyz)
-        channel = log.channel(topic, schemas.POSE)
-        found.append(Series(channel, t_ns, columns, partial(encode_pose, frame_id=WORLD)))
+        found.append(Series(log.channel(topic, schemas.POSE), t_ns, columns, partial(encode_pose, frame_id=WORLD)))
         if which == 0:
             encode = partial(encode_transform, frame_id=WORLD, child_frame_id=BODY)
             found.append(Series(log.channel("/tf", schemas.TF), t_ns, columns, encode))
@@ -151,8 +150,7 @@ def chunks(group: Sequence[Series]) -> Iterator[Chunk]:
         for index, series in enumerate(group):
             own_bytes = offsets[which[first:last] == index]
             if len(own_bytes):
-                rows = series.records(slice(done[index], done[index] + len(own_bytes)))
-                messages.scatter(data, own_bytes, rows)
+                messages.scatter(data, own_bytes, series.records(slice(done[index], done[index] + len(own_bytes))))
                 done[index] += len(own_bytes)
         channels = np.array([series.channel for series in group], np.uint16)[which[first:last]]
         yield Chunk(data.tobytes(), channels, times[first:last], offsets)

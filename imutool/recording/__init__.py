@@ -113,8 +113,7 @@ class Poses(Columns):
 
         start = int(self.t_ns[0])
         knots, wanted = seconds(self.t_ns, start), seconds(clipped, start)
-        share = (clipped - self.t_ns[after - 1]) / span_ns
-        q_wb_wxyz = quaternion.between_rows(self.q_wb_wxyz, after, share)
+        q_wb_wxyz = quaternion.between_rows(self.q_wb_wxyz, after, (clipped - self.t_ns[after - 1]) / span_ns)
         p_wb = interpolate(wanted, knots, self.p_wb)
         v_w = None if self.v_w is None else interpolate(wanted, knots, self.v_w)
         for column in (q_wb_wxyz, p_wb, *([] if v_w is None else [v_w])):  # so that the poses need no copy

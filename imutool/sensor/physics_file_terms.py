@@ -55,8 +55,7 @@ def factor(word: str) -> Variable | None:
     for pattern, change in CHANGES:
         found = re.fullmatch(pattern, word)
         if found and found[1] in VARIABLES:
-            power = float(found[2]) if found.lastindex == 2 else 1.0
-            return _Factor(VARIABLES[found[1]], change, power)
+            return _Factor(VARIABLES[found[1]], change, float(found[2]) if found.lastindex == 2 else 1.0)
     return None
 
 

@@ -57,15 +57,13 @@ class Sampler:
             first = [np.zeros((len(motion.t_s), 0))] if motion.R_wb is None else [motion.R_wb.reshape(-1, 9)]
             return np.concatenate([*first, *(values[:, None] for values in motion.channels.values())], axis=1)
 
-        both = self._others.made(motion.R_wb, motion.channels, columns)
-        return self._at_instants(both, instants)
+        return self._at_instants(self._others.made(motion.R_wb, motion.channels, columns), instants)
 
     def _at_instants(self, x: Float64[np.ndarray, "n k"], instants: Instants) -> Float64[np.ndarray, "m k"]:
         weights = instants[2]
         if isinstance(weights, slice):
             return self._values.made(x, instants, lambda: x[weights])
-        coefficients = self._coefficients.changed(x, None, _coefficients)
-        return self._values.changed(coefficients, instants, weights.__matmul__)
+        return self._values.changed(self._coefficients.changed(x, None, _coefficients), instants, weights.__matmul__)
 
     def _at(self, t_s: Times, taken_s: Float64[np.ndarray, " m"]) -> Instants:
         """Clock, instants, and matrix from coefficients to values, or the rows of the clock's own instants.

@@ -1,4 +1,4 @@
-"""Faults of a simulated IMU's kinematics and timing, and how much of its motion nothing explains."""
+"""Faults of a simulated IMU's motion and timing, and what of its motion nothing explains."""
 
 from __future__ import annotations
 

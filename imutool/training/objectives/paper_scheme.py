@@ -177,8 +177,7 @@ class PaperTraining(Training):
     def begin(self, sensor: Sensor) -> Stage:
         """Fresh stage from the current model, which moves the sensor's field."""
         chosen = self.settings.paper
-        field = self.model.get_submodule(f"drift.{sensor}")
-        adam = AdamW([(list(field.parameters()), chosen.weight_decay)])
+        adam = AdamW([(list(self.model.get_submodule(f"drift.{sensor}").parameters()), chosen.weight_decay)])
         last = get_ema_multi_avg_fn(0.0)  # type: ignore[no-untyped-call]  # torch gives it no type
         mean = AveragedModel(self.model.eval(), multi_avg_fn=last, use_buffers=True)
         return Stage(sensor, adam, mean, self._loss(sensor, self.model))
