@@ -10,6 +10,8 @@ and, so that sequences convert in parallel, fail one by one and are recognised b
     recognises(sequence: Sequence) -> bool                     whether it is really of this data set
     read_sequence(sequence: Sequence, *, images=True) -> Recording
 
+One of a file format, whatever data set it is from, says `GENERAL = True`: it lists only what it recognises.
+
 The first line of the module's docstring is its help. The data sets that ship have all four, and one contract test.
 """
 

@@ -105,8 +105,7 @@ def _list_tar(path: Path) -> Listing:
             if member.isdir() or not name.isprintable():
                 continue
             if member.issym() or member.islnk():
-                base = "" if member.islnk() else str(PurePosixPath(name).parent)
-                _check_link(path, name, member.linkname, base)
+                _check_link(path, name, member.linkname, "" if member.islnk() else str(PurePosixPath(name).parent))
             elif not member.isreg() or member.issparse():
                 raise DataError("is a device or a sparse file", where=f"{path}/{name}", expected="plain files")
             else:

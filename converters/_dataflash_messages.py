@@ -73,8 +73,7 @@ def read_messages(raw: bytes, remarks: Remarks) -> dict[str, Messages]:
     places, t_ns = places[order], np.concatenate([messages.t_ns for messages in timed])[order]
     untimed = sorted(name for name, messages in found.items() if _clock(messages) is None)
     for name in untimed:
-        before = np.maximum(np.searchsorted(places, found[name].places) - 1, 0)
-        found[name] = found[name]._replace(t_ns=t_ns[before])
+        found[name] = found[name]._replace(t_ns=t_ns[np.maximum(np.searchsorted(places, found[name].places) - 1, 0)])
     if untimed:
         remarks.notes.append(f"messages without a time have that of the message before them: {', '.join(untimed)}")
     return found

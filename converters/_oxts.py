@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses, Scalars
@@ -48,13 +47,6 @@ def read_oxts(
     scale = EARTH_M * np.cos(latitude[0])
     east, north = scale * longitude, scale * np.log(np.tan(np.pi / 4 + latitude / 2))
     p = np.stack([east - east[0], north - north[0], values[:, 2] - values[0, 2]], axis=1)
-    poses = Poses(kept.t_ns, p, _from_roll_pitch_yaw(values[:, 3:6]))
+    poses = Poses(kept.t_ns, p, quaternion.of_roll_pitch_yaw(values[:, 3:6]))
     remarks.notes.append("/oxts/pose is an estimate of GNSS and this IMU")
     return Imu(kept.t_ns, values[:, 17:20], values[:, 11:14]), {"/oxts/pose": poses}, {}
-
-
-def _from_roll_pitch_yaw(angles: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 4"]:
-    """Quaternions (wxyz) of Rz(yaw) Ry(pitch) Rx(roll)."""
-    from scipy.spatial.transform import Rotation
-
-    return quaternion.unit(Rotation.from_euler("ZYX", angles[:, ::-1]).as_quat()[:, [3, 0, 1, 2]])

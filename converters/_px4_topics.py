@@ -16,16 +16,14 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
 from imutool.geometry import quaternion
-from imutool.recording import Imu, Poses
+from imutool.geometry.quaternion import FLU_FROM_FRD
+from imutool.recording import Imu, Poses, interpolate
 from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import Remarks, Table
 from imutool.recording.sample_order import in_order
 
 MIN_IMU_HZ = 10.0  # slower logs of a sensor are samples for its temperature, not for its motion
-FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
 UP_FROM_DOWN = np.array([1.0, 1.0, -1.0])
-Q_ENU_FROM_NED_WXYZ = np.array([[0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0]])
-Q_FRD_FROM_FLU_WXYZ = np.array([[0.0, 1.0, 0.0, 0.0]])
 NO_ACCEL = 0x7FFFFFFF  # accelerometer_timestamp_relative without an accelerometer
 Columns = dict[str, np.ndarray]
 
@@ -137,13 +135,11 @@ def _poses(topics: dict[str, Columns], ending: str, remarks: Remarks) -> Poses |
         if has_position := len(moves.t_ns) > 1:
             inside = (t_ns >= moves.t_ns[0]) & (t_ns <= moves.t_ns[-1])
             t_ns, q_ned_frd, start = t_ns[inside], q_ned_frd[inside], moves.t_ns[0]
-            knots, t = (moves.t_ns - start).astype(float), (t_ns - start).astype(float)
-            both = np.stack([np.interp(t, knots, column) for column in moves.values.T], axis=1)
+            both = interpolate((t_ns - start).astype(float), (moves.t_ns - start).astype(float), moves.values)
             p_wb, v_w = both[:, :3] * UP_FROM_DOWN, both[:, 3:] * UP_FROM_DOWN if both.shape[1] > 3 else None
     if not has_position:
         remarks.notes.append(f"vehicle_attitude{ending} has no positions with it: those of its poses are zero")
-    q_wb = quaternion.multiply(quaternion.multiply(Q_ENU_FROM_NED_WXYZ, q_ned_frd), Q_FRD_FROM_FLU_WXYZ)
-    return Poses(t_ns, p_wb, quaternion.unit(q_wb), v_w)
+    return Poses(t_ns, p_wb, quaternion.unit(quaternion.enu_from_ned(q_ned_frd)), v_w)
 
 
 def table_of(name: str, columns: Columns, start_ns: int) -> Table:

@@ -211,8 +211,7 @@ def _renamed_field(field: Any) -> Any:
 
 def ros1_topic(name: str, kind: str, definition: str) -> MessageTopic:
     """Topic that keeps the encoding of ROS 1."""
-    spelled = kind.replace("/msg/", "/")
-    return MessageTopic(name, spelled, "ros1msg", definition.encode(), "ros1")
+    return MessageTopic(name, kind.replace("/msg/", "/"), "ros1msg", definition.encode(), "ros1")
 
 
 def same_layout(own: Mapping[str, Any], own_kind: str, standard: Mapping[str, Any], standard_kind: str) -> bool:

@@ -22,7 +22,7 @@ from ._table_mat import check_size, load_mat, names_of_mat
 from ._table_merged import join_calendar, join_milliseconds, join_stamps, settle_zones, sort_by_clock
 from ._table_mocap import is_mocap, read_mocap
 from ._table_motion import add_gravity
-from ._table_names import TIME_WORDS, group_of, leaf_of, split_name, tells_apart
+from ._table_names import group_of, is_named_time, leaf_of, tells_apart
 from ._table_numbers import is_number
 from ._table_numpy import load_npy, load_npz
 from ._table_packed import goes_back, read_bytes, text_head
@@ -113,7 +113,7 @@ def may_hold_several(path: Path) -> bool:
 
 def _times_fall(path: Path, names: list[str]) -> bool:
     """Whether a time of a Parquet file goes back."""
-    times = [name for name in names if re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(name)[0])]
+    times = [*filter(is_named_time, names)]
     with refusing(path):
         columns = _module("pyarrow.parquet", path).read_table(path, columns=times).columns if times else []
     plain = (column for column in columns if re.match(NUMBERS, str(column.type)) and not column.null_count)
@@ -197,7 +197,7 @@ def _numbers_of(schema: Any, columns: Columns) -> list[str]:
     """Names of the fields that hold numbers or times, also in lists and structures; the others are losses."""
     numbers = [f.name for f in schema if re.match(rf"{NUMBERS}|{VECTORS}|struct", str(f.type))]
     texts = [f.name for f in schema if re.match(r"large_string|string", str(f.type))]
-    words = [name for name in texts if tells_apart(name) or re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(name)[0])]
+    words = [name for name in texts if tells_apart(name) or is_named_time(name)]
     others = [field for field in schema if field.name not in (*numbers, *words)]
     columns.remarks.losses.extend(f"{field.name} is left out: it is of type {field.type}, no number" for field in others)
     return numbers + words

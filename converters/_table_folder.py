@@ -28,7 +28,7 @@ from ._table_header import MOSTLY
 from ._table_look import look, recorded_apart
 from ._table_map import POSES_GROUP, TRUTH_GROUP
 from ._table_merged import join_positions
-from ._table_names import TIME_WORDS, name_and_unit, split_name
+from ._table_names import TIME_WORDS, is_named_time, name_and_unit, split_name
 from ._table_numpy import npy_shape, read_npy
 from ._table_packed import read_bytes, table_name
 from ._table_roles import POSES, Names, role_folders, role_groups, shared_names, without_role
@@ -159,17 +159,13 @@ def _sensor_folders(folder: Path) -> list[Path]:
     folders = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
     if {*sensors_among(path.name for path in folders).values()} != {*SENSORS}:
         return []
-    return [path for path in folders if any(_is_time(array) for array in _arrays(path))]
+    return [path for path in folders if any(is_named_time(_stem(array)) for array in _arrays(path))]
 
 
 def _arrays(folder: Path) -> list[Path]:
     """Arrays of a folder, by their first bytes; their times first."""
     found = [path for path in folder.iterdir() if kind_of(head(path), path) == "npy"]
-    return sorted(found, key=lambda path: (not _is_time(path), path.name))
-
-
-def _is_time(path: Path) -> bool:
-    return re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(_stem(path))[0]) is not None
+    return sorted(found, key=lambda path: (not is_named_time(_stem(path)), path.name))
 
 
 def _stems(folder: Path) -> dict[Path, str]:
@@ -227,7 +223,7 @@ def _is_series(path: Path) -> bool:
 
 def _is_clock(path: Path) -> bool:
     """Whether a table is named as a time and holds nothing else."""
-    if not _is_time(path):
+    if not is_named_time(_stem(path)):
         return False
     if kind_of(head(path), path) != "npy":
         return _is_narrow(path) and not is_text_table(head(path), 2)
@@ -249,7 +245,7 @@ def _clocks(folder: Path) -> dict[str, tuple[np.ndarray, str]]:
 
 def _give_time(part: Columns, path: Path, clocks: dict[str, tuple[np.ndarray, str]]) -> None:
     """Add the time of the clock with as many rows to a table without one; of several that whose name its own begins with."""
-    has_time = any(re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(name)[0]) for name in part.values)
+    has_time = any(map(is_named_time, part.values))
     length = len(next(iter(part.values.values()), ()))
     fits = [name for name, (values, _) in clocks.items() if len(values) == length]
     if has_time or not fits:

@@ -10,7 +10,7 @@ from pathlib import Path
 from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
-from ._table_names import TIME_WORDS, UNITS, distinct_names, split_name, unit_named
+from ._table_names import TIME_WORDS, UNITS, distinct_names, is_named_time, split_name, unit_named
 from ._table_numbers import fields_of, is_number
 
 MAX_WORDS = 10  # in a refusal
@@ -79,8 +79,7 @@ def _lacks_first(names: list[str], first: list[str]) -> bool:
     if not all(names) or any(map(is_number, names)) or not all(map(is_number, first)) or len(first) < 3:
         return False
     steps = {round(float(b) - float(a), 9) for a, b in pairwise(text.replace(",", ".") for text in first)}
-    named_time = any(re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(name)[0]) for name in names)
-    return steps == {1.0} if named_time else min(steps) > 0.0
+    return steps == {1.0} if any(map(is_named_time, names)) else min(steps) > 0.0
 
 
 def _are_units(texts: list[str]) -> bool:

@@ -142,8 +142,7 @@ def _labels(name: str, value: Any, beside: dict[str, Any]) -> list[str]:
         return []
     own = f"{name}_label"
     named = [beside[own]] if own in beside else [texts for key, texts in beside.items() if LABELS.search(key)]
-    found = map(_texts, named)
-    return next((texts for texts in found if len(texts) == value.shape[1] == len(set(texts))), [])
+    return next((texts for texts in map(_texts, named) if len(texts) == value.shape[1] == len(set(texts))), [])
 
 
 def _texts(value: Any) -> list[str]:

@@ -138,8 +138,7 @@ def _qualisys(rows: list[list[str]], columns: Columns, path: Path) -> list[str]:
         if place + 9 > len(axes):
             continue
         bodies.append(axes[first].removesuffix("X").strip() or stated.get("BODY_NAMES", "body"))
-        matrices = table[:, place : place + 9].reshape(-1, 3, 3).transpose(0, 2, 1)
-        q_wxyz = of_matrices(matrices, path)
+        q_wxyz = of_matrices(table[:, place : place + 9].reshape(-1, 3, 3).transpose(0, 2, 1), path)
         _add_body(columns, bodies[-1], table[:, first : first + 3], q_wxyz[:, [1, 2, 3, 0]], "mm")
     return bodies[::-1]
 

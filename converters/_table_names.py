@@ -164,6 +164,11 @@ def is_of_sensors(column: str) -> bool:
     )
 
 
+def is_named_time(name: str) -> bool:
+    """Whether a name is that of a time, or ends as one: `gps_time`."""
+    return re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(name)[0]) is not None
+
+
 def tells_apart(column: str) -> bool:
     """Whether a column is named as one that tells recordings or sensors apart."""
     return is_of_recordings(column) or is_of_sensors(column)

@@ -7,7 +7,6 @@ Columns of one length are a table.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -21,7 +20,7 @@ from imutool.errors import ConfigError, DataError
 from . import Sequence
 from ._source import head
 from ._table_files import kind_of, load, may_hold_several
-from ._table_names import TIME_WORDS, group_of, is_of_recordings, is_of_sensors, leaf_of, split_name, tells_apart
+from ._table_names import group_of, is_named_time, is_of_recordings, is_of_sensors, leaf_of, tells_apart
 from ._table_recordings import distinct, groups_apart, part_name, renamed
 from ._table_text import Columns, no_numbers
 from ._table_times import is_counter
@@ -76,7 +75,7 @@ def refuse_joined(columns: Columns, gyro: str, place: Path) -> None:
         if tells_apart(leaf):
             labels = _texts(values)
             what = f"{name!r} has {len(np.unique(labels))} values, as of several recordings" if labels is not None else ""
-        elif (_is_time(leaf) or is_counter(leaf)) and len(rows := begun_anew(values)):
+        elif (is_named_time(leaf) or is_counter(leaf)) and len(rows := begun_anew(values)):
             what = f"{name!r} begins anew in row {rows[0] + 1}, as of {len(rows) + 1} recordings"
         if what:
             raise ConfigError(f"{what}, and `rate_hz` would join them", where=place, expected="rows of one recording", fix=FIX)
@@ -118,14 +117,10 @@ def _labels(columns: Columns, is_named: Callable[[str], bool]) -> dict[int, Labe
     return found
 
 
-def _is_time(name: str) -> bool:
-    return re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(name)[0]) is not None
-
-
 def _clocks(columns: Columns, order: Rows, seams: Int64[np.ndarray, " k"]) -> list[np.ndarray]:
     """Times of a table, in the order of its parts; each goes on within a part."""
     of_rows = ((name, values) for name, values in columns.values.items() if len(values) == len(order))
-    named = (values[order].astype(float) for name, values in of_rows if _is_time(name))
+    named = (values[order].astype(float) for name, values in of_rows if is_named_time(name))
     inside = np.delete(np.arange(len(order) - 1), seams - 1)
     steps = ((values, np.diff(values)[inside]) for values in named)
     return [
@@ -166,7 +161,7 @@ def _parts(columns: Columns) -> dict[str, TableRows]:
 
 def _begun(columns: Columns) -> dict[int, Labels]:
     """Number of each row's recording, where all times of a file begin anew in the same rows; none in any other file."""
-    times = {name: values for name, values in columns.values.items() if _is_time(leaf_of(name))}
+    times = {name: values for name, values in columns.values.items() if is_named_time(leaf_of(name))}
     bounds = {(0, *begun_anew(values).tolist(), len(values)) for values in times.values()}
     if len(bounds) != 1:
         return {}
@@ -256,6 +251,5 @@ def _grouped(columns: Columns, length: int, sensors: Labels) -> Columns:
     for code in dict.fromkeys(codes.tolist()):
         rows = np.flatnonzero(codes == code)
         label = "_".join(str(texts[rows[0]]) for texts in sensors.values())
-        part = _with_rows(replace(renamed(columns, names), labels={}), {length: rows})
-        whole.take(label, part, label)
+        whole.take(label, _with_rows(replace(renamed(columns, names), labels={}), {length: rows}), label)
     return whole

@@ -13,6 +13,7 @@ import numpy as np
 from imutool.array_types import Bool, Float64
 from imutool.errors import DataError
 from imutool.geometry import quaternion
+from imutool.recording import interpolate
 
 from ._table_map import Entries
 from ._table_text import Columns
@@ -57,13 +58,6 @@ def of_matrices(matrices: Float64[np.ndarray, "n 3 3"], where: Path | None = Non
     q_wxyz = np.zeros((len(matrices), 4))
     q_wxyz[known] = quaternion.unit(Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]])
     return q_wxyz
-
-
-def of_angles(angles: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 4"]:
-    """Quaternions (wxyz) of Rz(yaw) Ry(pitch) Rx(roll), in rad; zeros where one is missing."""
-    about = [quaternion.exp(axis * angle[:, None]) for axis, angle in zip(np.eye(3), np.nan_to_num(angles).T, strict=True)]
-    q_wxyz = quaternion.multiply(about[2], quaternion.multiply(about[1], about[0]))
-    return np.where(np.isfinite(angles).all(axis=1)[:, None], q_wxyz, 0.0)
 
 
 def known_rotations(q_wxyz: Float64[np.ndarray, "n 4"], topic: str) -> tuple[Bool[np.ndarray, " n"], list[str]]:
@@ -120,7 +114,7 @@ def up_share(
     if len(t_s) != len(force):
         return 0.0
     known = np.isfinite(t_s) & np.isfinite(force).all(axis=1)
-    at_poses = np.stack([np.interp(at_s, t_s[known], axis) for axis in force[known].T], axis=1)
+    at_poses = interpolate(at_s, t_s[known], force[known])
     unit = np.abs(np.linalg.norm(q_wxyz, axis=1) - 1.0) < NOT_UNIT
     mean = quaternion.rotate(q_wxyz[unit], at_poses[unit] @ turn.T).mean(axis=0)
     return float(mean[2] / np.linalg.norm(mean))
@@ -216,7 +210,7 @@ def rotations(columns: Columns, entries: Entries) -> Float64[np.ndarray, "n 4"]:
     """Quaternions (wxyz) of the columns that the entries name."""
     if "roll_pitch_yaw" in entries:
         angles = columns.side_by_side(entries["roll_pitch_yaw"])
-        return of_angles(angles * ANGLE_SI[str(entries["roll_pitch_yaw_unit"])])
+        return quaternion.of_roll_pitch_yaw(angles * ANGLE_SI[str(entries["roll_pitch_yaw_unit"])])
     if "rotation_matrix" in entries:
         matrices = columns.side_by_side(entries["rotation_matrix"]).reshape(-1, 3, 3)
         is_rotation = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) < ORTHOGONAL
@@ -275,7 +269,7 @@ def _turns_alike(
     if spans[kept].sum() < MIN_S:
         return _Alike(0.0, 0.0, 0.0, np.eye(3))
     turned = quaternion.log(quaternion.multiply(quaternion.inverse(q[:-1]), q[1:]))[kept]
-    measured = np.diff(np.stack([np.interp(at, gyro.t_s, angle) for angle in gyro.angles.T], axis=1), axis=0)[kept]
+    measured = np.diff(interpolate(at, gyro.t_s, gyro.angles), axis=0)[kept]
     turned, measured = turned - turned.mean(axis=0), measured - measured.mean(axis=0)
     product = turned.T @ measured
     left, singular, right = np.linalg.svd(product)

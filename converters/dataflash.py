@@ -17,6 +17,7 @@ import numpy as np
 
 from imutool.errors import DataError
 from imutool.geometry import quaternion
+from imutool.geometry.quaternion import FLU_FROM_FRD
 from imutool.recording import Imu, Poses, Scalars
 from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import MessageLog, Remarks, Table
@@ -25,7 +26,6 @@ from imutool.recording.sample_order import in_order
 from . import Sequence
 from ._archive import refusing
 from ._dataflash_messages import FMT, FMT_SIZE, HEAD, TEXT_START, Messages, read_messages, text_of
-from ._px4_topics import FLU_FROM_FRD, Q_ENU_FROM_NED_WXYZ, Q_FRD_FROM_FLU_WXYZ
 from ._source import find_files
 
 GENERAL = True
@@ -40,11 +40,6 @@ def sequences(source: Path) -> list[Sequence]:
     """DataFlash logs in the source, by their first bytes: the format of the formats."""
     starts = HEAD + bytes([FMT, FMT, FMT_SIZE]), TEXT_START
     return find_files(source, (".bin", ".log"), lambda start: start.startswith(starts))
-
-
-def recognises(sequence: Sequence) -> bool:
-    """Whether a sequence is a DataFlash log: always, as only these are listed."""
-    return True
 
 
 def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
@@ -175,12 +170,7 @@ def _poses(messages: dict[str, Messages], remarks: Remarks) -> dict[str, Poses]:
     values = np.stack([*(rows[f] for f in POSE_FIELDS[:6]), *angles], axis=1).astype(float)
     kept = in_order(group.t_ns, values, "/ekf/pose")
     remarks.notes.extend(kept.notes)
-    roll, pitch, yaw = np.radians(kept.values[:, 6:]).T
-    about_x, about_y, about_z = np.eye(3)[:, None, :] * np.stack([roll, pitch, yaw])[:, :, None]
-    q_ned_frd = quaternion.multiply(
-        quaternion.multiply(quaternion.exp(about_z), quaternion.exp(about_y)), quaternion.exp(about_x)
-    )
-    q_wb = quaternion.multiply(quaternion.multiply(Q_ENU_FROM_NED_WXYZ, q_ned_frd), Q_FRD_FROM_FLU_WXYZ)
+    q_wb = quaternion.enu_from_ned(quaternion.of_roll_pitch_yaw(np.radians(kept.values[:, 6:])))
     up = np.array([1.0, 1.0, -1.0])
     return {"/ekf/pose": Poses(kept.t_ns, kept.values[:, :3] * up, quaternion.unit(q_wb), kept.values[:, 3:6] * up)}
 

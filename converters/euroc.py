@@ -27,11 +27,7 @@ TRUTHS = {
 SEQUENCES = re.compile(r"(MH_0[1-5]|V[12]_0[1-3])(_(easy|medium|difficult))?")
 BAG_SIGNS = {"/vicon/firefly_sbx/firefly_sbx", "/leica/position"}
 BAG_TRUTHS = ("/vicon/firefly_sbx/firefly_sbx",)
-
-
-def sequences(source: Path) -> list[Sequence]:
-    """Sequences in the source: ASL folders and bags, named like the folder or archive."""
-    return find(source)
+sequences = find  # ASL folders and bags, named like the folder or archive
 
 
 def recognises(sequence: Sequence) -> bool:
@@ -44,11 +40,6 @@ def recognises(sequence: Sequence) -> bool:
         return _asl.IMU_TOPIC in topics and "/vrpn_client/raw_transform" not in topics and bool(BAG_SIGNS & topics.keys())
     tree = Tree(sequence)
     return "mocap0" not in tree.sensors() and not _asl.float_stamps(tree)
-
-
-def is_known(sequence: Sequence) -> bool:
-    """Whether a sequence shows its origin: by its name, or by its bag's topics."""
-    return bool(SEQUENCES.fullmatch(sequence.name)) or (is_bag(sequence.path) and recognises(sequence))
 
 
 def _names_sensor(sequence: Sequence) -> bool:
@@ -64,7 +55,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
         DataError: the sequence contradicts its format, with file and line.
         ConfigError: it is a bag and rosbags is not installed.
     """
-    known = is_known(sequence)
+    known = bool(SEQUENCES.fullmatch(sequence.name)) or (is_bag(sequence.path) and recognises(sequence))  # it shows its origin
     sensor = SENSOR if known or (not is_bag(sequence.path) and _names_sensor(sequence)) else ""
     return _bag.recording_of(sequence, DATASET, sensor, known, TRUTHS, BAG_TRUTHS, images)
 

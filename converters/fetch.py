@@ -18,11 +18,7 @@ from ._source import Tree, find, is_bag
 DATASET, SENSOR = "fetch", "fetch"
 BAG_IMU = "/base/imu"
 TRUTHS = {"mocap0": "/ground_truth/pose"}
-
-
-def sequences(source: Path) -> list[Sequence]:
-    """Sequences in the source: ASL folders and bags, named like the folder or archive."""
-    return find(source)
+sequences = find  # ASL folders and bags, named like the folder or archive
 
 
 def recognises(sequence: Sequence) -> bool:

@@ -51,11 +51,6 @@ def _logs(folder: Path) -> list[Sequence]:
     return find_files(folder, (".mcap",), lambda start: start.startswith(MAGIC))
 
 
-def recognises(sequence: Sequence) -> bool:
-    """Whether a sequence is an MCAP log: always, as only logs are listed."""
-    return True
-
-
 def as_defined(topic: MessageTopic) -> MessageTopic:
     """The topic with the definition that the log has."""
     return topic
@@ -74,8 +69,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, define: Define = a
         note = f"the bag has no {METADATA}; read in this order: {', '.join(path.name for path in paths)}"
         return read_parts(sequence, paths, Remarks([note]), images=images, define=define)
     with _refusing(sequence.path), sequence.path.open("rb") as file:
-        reader = _reader(file)
-        summary = summary_of(reader, file)
+        summary = summary_of(_reader(file), file)
         content = Content(summary, file)
         of_channel = summary.statistics.channel_message_counts if summary.statistics is not None else {}
         counts: dict[str, int] = {}

@@ -47,11 +47,6 @@ def logs_in(folder: Path) -> dict[str, list[Path]]:
     return {name: logs[name] for name in sorted(logs)}
 
 
-def recognises(sequence: Sequence) -> bool:
-    """Whether a sequence has such tables: always, as only these are listed."""
-    return True
-
-
 def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     """Message log of the tables.
 

@@ -44,11 +44,6 @@ def sequences(source: Path) -> list[Sequence]:
     return find_files(source, SUFFIXES, lambda head: head.startswith(records.MAGIC))
 
 
-def recognises(sequence: Sequence) -> bool:
-    """Whether a sequence is a bag: always, as only bags are listed."""
-    return True
-
-
 def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     """Message log of a bag.
 

@@ -42,11 +42,6 @@ def sequences(source: Path) -> list[Sequence]:
     return folders + [file for file in files if file.path.parent not in taken and _has_messages(file.path)]
 
 
-def recognises(sequence: Sequence) -> bool:
-    """Whether a sequence is a bag: always, as only bags are listed."""
-    return True
-
-
 def parts(sequence: Sequence) -> list[Path]:
     """Storage files of a bag's folder: those that its metadata.yaml names, if all are there."""
     path = sequence.path

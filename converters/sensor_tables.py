@@ -18,7 +18,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
-from imutool.recording import Imu, Poses, Scalars
+from imutool.recording import Imu, Poses, Scalars, interpolate
 from imutool.recording.joined_imu import joined, unit_by_gravity
 from imutool.recording.message_log import MessageLog, Remarks
 from imutool.recording.sample_order import in_order, lost_to_set_back
@@ -79,11 +79,6 @@ def _in_zip(path: Path) -> list[Sequence]:
         folders = sorted({re.sub(PLACE, "", member) for member in list_members(path).sizes if not re.search(HIDDEN, member)})
         return [Sequence(PurePosixPath(f).name or name(path), path, f) for f in folders if is_phone(path, f)]
     return []
-
-
-def recognises(sequence: Sequence) -> bool:
-    """Whether a sequence has such tables: always, as only these are listed."""
-    return True
 
 
 def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
@@ -218,10 +213,8 @@ def _acceleration(
             raise DataError(f"{tables[named]} has no gravity in it, and no other acceleration is there", where=where, fix=FIX)
         return t_ns, accel, (named,)
     other_ns, gravity = _vector(files, tables["gravity"], clock, where, remarks)
-    start = t_ns[0]
-    t, knots = (t_ns - start).astype(float), (other_ns - start).astype(float)
-    whole = accel + np.stack([np.interp(t, knots, column) for column in gravity.T], axis=1)
-    return t_ns, whole, (named, "gravity")
+    steady = interpolate((t_ns - t_ns[0]).astype(float), (other_ns - t_ns[0]).astype(float), gravity)
+    return t_ns, accel + steady, (named, "gravity")
 
 
 def _is_ios(files: _Files) -> bool:

@@ -50,7 +50,7 @@ from ._table_packed import table_name
 from ._table_parts import load_table, recordings_in, refuse_joined
 from ._table_pose_names import why_no_poses
 from ._table_propose import propose, without_copies
-from ._table_rotations import known_rotations, of_angles, of_matrices, unit_by_poses
+from ._table_rotations import known_rotations, of_matrices, unit_by_poses
 from ._table_text import Columns, matrix_columns
 from ._table_times import COUNTED, begun_at_zero, count_times
 from ._table_units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
@@ -69,11 +69,6 @@ def sequences(source: Path) -> list[Sequence]:
     if not source.exists():
         raise DataError("does not exist", where=source, expected="a file or a folder")
     return recordings_in(Sequence(name(Path(table_name(source))), source)) if kind_of(head(source), source) else []
-
-
-def recognises(sequence: Sequence) -> bool:
-    """Whether a sequence is a table: always, as only tables are listed."""
-    return True
 
 
 def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Mapping[str, Any] | None = None) -> MessageLog:
@@ -256,7 +251,8 @@ def _rotations(columns: Columns, table: TableMap, where: Path) -> Float64[np.nda
     if table.quaternion_wxyz:
         return vectors_named(columns, table.quaternion_wxyz, 1.0, 0.0, where)
     if table.roll_pitch_yaw:
-        return of_angles(vectors_named(columns, table.roll_pitch_yaw, ANGLE_SI[table.roll_pitch_yaw_unit], 0.0, where))
+        angles = vectors_named(columns, table.roll_pitch_yaw, ANGLE_SI[table.roll_pitch_yaw_unit], 0.0, where)
+        return quaternion.of_roll_pitch_yaw(angles)
     nine = matrix_columns(table.rotation_matrix)
     return of_matrices(vectors_named(columns, nine, 1.0, 0.0, where).reshape(-1, 3, 3), where)
 

@@ -44,11 +44,6 @@ def recognises(sequence: Sequence) -> bool:
     return "mocap0" in tree.sensors() and not _asl.float_stamps(tree)
 
 
-def is_known(sequence: Sequence) -> bool:
-    """Whether a sequence shows its origin: its name, or its bag's topics."""
-    return bool(SEQUENCES.fullmatch(sequence.name)) or (is_bag(sequence.path) and recognises(sequence))
-
-
 def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
     """Recording of one sequence.
 
@@ -56,7 +51,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
         DataError: the sequence contradicts its format, with file and line.
         ConfigError: it is a bag and rosbags is not installed.
     """
-    known = is_known(sequence)
+    known = bool(SEQUENCES.fullmatch(sequence.name)) or (is_bag(sequence.path) and recognises(sequence))  # it shows its origin
     return _bag.recording_of(sequence, DATASET, SENSOR if known else "", known, TRUTHS, BAG_TRUTHS, images)
 
 

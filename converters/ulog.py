@@ -8,6 +8,7 @@ messages of the types px4_msgs. Stamps are PX4's own clock, in most logs the tim
 from __future__ import annotations
 
 import logging
+import struct
 from collections.abc import Iterator
 from contextlib import redirect_stdout
 from functools import partial
@@ -18,28 +19,28 @@ from pathlib import Path
 from typing import Any
 
 from imutool.errors import DataError, required
-from imutool.recording.message_log import MessageLog, Remarks
+from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
 from ._px4_topics import Columns, imus_of, poses_of, table_of
 from ._source import find_files, head
-from ._ulog_texts import log_topic, logged
 
 GENERAL = True
 MAGIC, ENCRYPTED = b"ULog\x01\x12\x35", b"ULogEnc"
 HEADER_BYTES = 16
 READS_A_BYTE = 2  # at most: where it finds damage, pyulog reads head and content of a message at each byte
 LATEST_US = 2**31 * 1_000_000  # that the stamp of a ROS 2 message holds
+LOG_DEFINITION = (
+    "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line\n"
+    f"{'=' * 80}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+)
+LOG_LEVELS = {"DEBUG": 10, "INFO": 20, "NOTICE": 20, "WARNING": 30, "ERROR": 40}  # of rcl_interfaces/Log; others are fatal
+TEXTS = MessageTopic("/logged_messages", "rcl_interfaces/msg/Log", "ros2msg", LOG_DEFINITION.encode(), "cdr")
 
 
 def sequences(source: Path) -> list[Sequence]:
     """ULog files in the source, by their first bytes."""
     return find_files(source, (".ulg", ".ulge"), lambda start: start.startswith((MAGIC, ENCRYPTED)))
-
-
-def recognises(sequence: Sequence) -> bool:
-    """Whether a sequence is a ULog: always, as only ULogs are listed."""
-    return True
 
 
 def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
@@ -76,8 +77,8 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     return MessageLog(
         sequence.name,
         sequence.path.name,
-        topics=(log_topic(),) if texts else (),
-        messages=partial(logged, texts),
+        topics=(TEXTS,) if texts else (),
+        messages=partial(_logged, texts),
         imus=imus_of(topics, remarks),
         poses=poses,
         tables={f"/{name}": table_of(name, columns, start_ns) for name, columns in topics.items()},
@@ -96,8 +97,7 @@ def _open(path: Path) -> Any:
     pyulog = required("pyulog", "ulog", where=path, user="reading ULogs")
     if head(path, len(ENCRYPTED)) == ENCRYPTED:
         raise DataError("is encrypted", where=path, fix="Decrypt it with PX4's Tools/decrypt_ulog.py first")
-    printing = logging.getLogger("pyulog")
-    printing.setLevel(logging.ERROR)
+    logging.getLogger("pyulog").setLevel(logging.ERROR)
     try:
         # pyulog leaves a file that it refuses open, and prints where our reports go
         with _FiniteFile(FileIO(path)) as file, redirect_stdout(StringIO()):
@@ -139,3 +139,18 @@ def _metadata(sequence: Sequence, ulog: Any) -> dict[str, dict[str, str]]:
         "px4/changed_parameters": {f"{t} us {name}": str(value) for t, name, value in ulog.changed_parameters},
         "px4/dropouts": {f"{dropout.timestamp} us": f"{dropout.duration} ms" for dropout in ulog.dropouts},
     }
+
+
+def _logged(lines: list[tuple[int, str, str]]) -> Iterator[Message]:
+    """Text messages of PX4, as ROS 2 logs them."""
+    for t_ns, level, text in sorted(lines, key=lambda line: line[0]):
+        payload = bytearray(b"\0\1\0\0") + struct.pack("<iIB", *divmod(t_ns, 10**9), LOG_LEVELS.get(level, 50))
+        for part in ("px4", text, "", ""):
+            _put_text(payload, part)
+        payload += bytes(-(len(payload) - 4) % 4) + struct.pack("<I", 0)
+        yield Message(TEXTS, t_ns, t_ns, bytes(payload))
+
+
+def _put_text(payload: bytearray, text: str) -> None:
+    raw = text.encode("utf-8", "replace") + b"\0"
+    payload += bytes(-(len(payload) - 4) % 4) + struct.pack("<I", len(raw)) + raw

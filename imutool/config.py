@@ -42,8 +42,7 @@ def load(cls: type[S], path: Path | None = None, overrides: Iterable[str] = ()) 
     Raises:
         ConfigError: file unreadable or not TOML, unknown key (the nearest is named), wrong type, out of range.
     """
-    values = {} if path is None else toml(path, "settings")
-    return build(cls, entries(overrides, "set", values), where=path)
+    return build(cls, entries(overrides, "set", {} if path is None else toml(path, "settings")), where=path)
 
 
 def entries(words: Iterable[str], parameter: str, values: dict[str, Any] | None = None) -> dict[str, Any]:

@@ -138,8 +138,7 @@ class Debiaser:
             encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], covariance, batch.frame_id),
         )
         if self._watch is not None and len(batch.stamp_ns):
-            std = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
-            self._watch(DebiasedBlock(self.source_topic, batch, bias, std))
+            self._watch(DebiasedBlock(self.source_topic, batch, bias, np.sqrt(covariance.diagonal(axis1=1, axis2=2))))
         return DerivedBatch(batch, payloads)
 
 

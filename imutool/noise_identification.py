@@ -17,7 +17,7 @@ from imutool.config import build
 from imutool.errors import DataError, LogError
 from imutool.file_location import Location
 from imutool.inertial.stationary import CALM, rest_stretches, white_noise
-from imutool.log_info.unit_conversion import in_si_units
+from imutool.log_info.imu_motion import in_si_units
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import longest_recording, read_recordings
 from imutool.noise import allan

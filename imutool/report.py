@@ -119,8 +119,7 @@ def json_schema(name: str) -> dict[str, Any]:
     Raises:
         ConfigError: no report has this name; the message names the nearest.
     """
-    schema = msgspec.json.schema(report_type(name))
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **msgspec.json.schema(report_type(name))}
 
 
 def _plain(value: Any) -> Any:

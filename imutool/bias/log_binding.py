@@ -183,8 +183,7 @@ def _remarks(channel: Scalars, name: str, start_ns: int, end_ns: int, low: float
     if T.min() < low - MAX_BEYOND_K or T.max() > high + MAX_BEYOND_K:
         gone, trained = f"{T.min():.1f} to {T.max():.1f} °C", f"{low:.1f} to {high:.1f} °C"
         out.append(f"{name} goes from {gone}, and training had {trained}: beyond, the bias goes on straight and is less sure")
-    edges = np.concatenate([[start_ns], within.t_ns, [end_ns]])
-    age_s = float(np.diff(edges).max()) * 1e-9
+    age_s = float(np.diff(np.concatenate([[start_ns], within.t_ns, [end_ns]])).max()) * 1e-9
     if age_s > MAX_AGE_S:
         out.append(f"{name} is silent for {age_s:.0f} s: its last number holds")
     return out

@@ -87,8 +87,7 @@ def forms(sensor: Sensor, names: Sequence[str]) -> tuple[LinearForm, ...]:
 
 def columns_of(effects: Sequence[LinearForm], *, temperature: bool) -> Int64[np.ndarray, " p"]:
     """Parameters of the drift with the temperature, or those of the other effects."""
-    wanted = [(effect.name in EFFECTS) == temperature for effect in effects for _ in effect.parameters]
-    return np.flatnonzero(wanted)
+    return np.flatnonzero([(effect.name in EFFECTS) == temperature for effect in effects for _ in effect.parameters])
 
 
 def samples_alone(effects: Sequence[LinearForm]) -> tuple[LinearForm, ...]:

@@ -213,5 +213,4 @@ def _between(imu: Imu, state: State, resting: bool) -> Poses:
     from scipy.spatial.transform import Rotation
 
     q_wb_wxyz = Rotation.from_matrix(state.R_wb).as_quat(scalar_first=True)
-    corrected = Imu(imu.t_ns, imu.gyro - bias[:3], imu.accel - bias[3:])
-    return dead_reckon(corrected, (q_wb_wxyz, state.p_wb, state.v_w))
+    return dead_reckon(Imu(imu.t_ns, imu.gyro - bias[:3], imu.accel - bias[3:]), (q_wb_wxyz, state.p_wb, state.v_w))

@@ -80,8 +80,7 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
         blocks = list(itertools.islice(filter_blocks(model, _pieces(imu), before), len(blocks)))
     constant = blocks[0].resting and not _drifts(gyro[at_stop])
     track = None if constant else smooth_bias(model, [(t_s, gyro, accel)], before).track
-    last = [blocks[-1].step.after] * 2
-    (rest, _), (_, P) = before.supported(last, np.full(2, end_s), np.array([True, False]))
+    (rest, _), (_, P) = before.supported([blocks[-1].step.after] * 2, np.full(2, end_s), np.array([True, False]))
     std = np.sqrt(np.diag(P))  # in motion, where the bias is used
     source = f"{end_s - begin_s:.1f} s at rest from {begin_s:.1f} s on" + f", {training_source(model)}" * bool(model.card)
     how = f"{source}, {accuracy(std)}, then {TRACKED_BY}"

@@ -45,8 +45,7 @@ class BiasTrajectory(NamedTuple):
         return np.asarray(self.std[self._row(t_s)])
 
     def _row(self, t_s: Float64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-        row = np.searchsorted(self.t_s, t_s, side="right") - 1
-        return np.clip(row, 0, len(self.rest) - 1)
+        return np.clip(np.searchsorted(self.t_s, t_s, side="right") - 1, 0, len(self.rest) - 1)
 
 
 class FilteredBlock(NamedTuple):

@@ -256,8 +256,7 @@ class OnlineDebiaser:
         """Seconds since the first sample; a jump of the clock counts as at most `stretches.MAX_GAP_S`."""
         if not self._begun:
             self._begun, self._start_ns, self._before_ns = True, stamp_ns, stamp_ns
-            start = self._start or tracked_from_prior(self._model, stamp_ns)
-            self._correct = self._correction(start)
+            self._correct = self._correction(self._start or tracked_from_prior(self._model, stamp_ns))
         step_ns = stamp_ns - self._before_ns
         if -GAP_NS < step_ns < 0:  # out of order: no time passes
             self._start_ns += step_ns

@@ -179,8 +179,7 @@ class StretchClock:
         """
         if not len(stamp_ns):
             return stamp_ns
-        before = np.int64(stamp_ns[0] - 1 if self._last_ns is None else self._last_ns)
-        step = np.diff(stamp_ns, prepend=before)
+        step = np.diff(stamp_ns, prepend=np.int64(stamp_ns[0] - 1 if self._last_ns is None else self._last_ns))
         gap_ns, max_ns = nanoseconds(GAP_S), nanoseconds(MAX_GAP_S)
         wrong = (step <= 0) & (step > -gap_ns)
         if wrong.any():

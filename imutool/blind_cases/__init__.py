@@ -85,8 +85,7 @@ def conceal(
             raise ConfigError("the folder holds a case already", where=folder / name, fix="Choose another folder")
     recording = read(trajectory, truth=truth)
     chosen = secrets.randbits(64) if seed is None else seed
-    planned = plan(recording, chosen, kind, size, noise, effects, longest_s)
-    _write(folder, planned, pose_noise, chosen, recording.name)
+    _write(folder, plan(recording, chosen, kind, size, noise, effects, longest_s), pose_noise, chosen, recording.name)
 
 
 def plan(

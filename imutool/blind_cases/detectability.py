@@ -130,8 +130,7 @@ def _small(model: Model, duration_s: float) -> list[list[Theta]]:
 def _orthonormal(columns: Float64[np.ndarray, "m p"]) -> Float64[np.ndarray, "m q"]:
     """Basis of the columns' span, each column with the same weight."""
     lengths = np.linalg.norm(columns, axis=0)
-    scaled = columns[:, lengths > 0.0] / lengths[lengths > 0.0]
-    left, singular, _ = np.linalg.svd(scaled, full_matrices=False)
+    left, singular, _ = np.linalg.svd(columns[:, lengths > 0.0] / lengths[lengths > 0.0], full_matrices=False)
     out: Float64[np.ndarray, "m q"] = left[:, singular > 1e-6]
     return out
 
@@ -170,8 +169,7 @@ def cramer_rao_bounds(scene: Scene, acting: Acting) -> list[Theta | None]:
 def _deviations(jacobian: Float64[np.ndarray, "m p"]) -> list[float]:
     """Square roots of the diagonal of (J^T J)^-1; infinite for parameters that J does not separate."""
     lengths = np.linalg.norm(jacobian, axis=0)
-    scaled = jacobian / np.where(lengths > 0.0, lengths, 1.0)
-    _, singular, right = np.linalg.svd(scaled, full_matrices=False)
+    _, singular, right = np.linalg.svd(jacobian / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
     good = singular > 1e-7
     variance = np.sum((right[good] / singular[good, None]) ** 2, axis=0) / np.where(lengths > 0.0, lengths, 1.0) ** 2
     hidden = (np.sum(right[~good] ** 2, axis=0) > 1e-6) | (lengths == 0.0)

@@ -156,8 +156,7 @@ def _robust_weights(t: Times, y: Float64[np.ndarray, "n k"], knots: Knots, penal
 
 
 def _knots(first_s: float, last_s: float) -> Knots:
-    count = int(np.ceil((last_s - first_s) / KNOT_S)) + 1
-    inner = np.linspace(first_s, last_s, count)
+    inner = np.linspace(first_s, last_s, int(np.ceil((last_s - first_s) / KNOT_S)) + 1)
     step = inner[1] - inner[0]
     before = first_s - step * np.arange(DEGREE, 0, -1)
     return np.concatenate([before, inner, last_s + step * np.arange(1, DEGREE + 1)])
@@ -179,14 +178,12 @@ def _solve(t: Times, y: Float64[np.ndarray, "n k"], weights: Times, knots: Knots
         for k, product in enumerate(products):  # D^T D at (k + i, k + shift + i) for each difference i
             columns = np.arange(size - 3) + k + shift
             band[DEGREE - shift, columns] += penalty * product
-    coefficients = solveh_banded(band, weighted.T @ y)
-    return BSpline(knots, coefficients, DEGREE)
+    return BSpline(knots, solveh_banded(band, weighted.T @ y), DEGREE)
 
 
 def _signs(q: Float64[np.ndarray, "n 4"]) -> Times:
     """Signs that keep neighbours in one hemisphere."""
-    turns = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0)
-    return np.concatenate([[1.0], np.cumprod(turns)])
+    return np.concatenate([[1.0], np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))])
 
 
 def _vector_part(a: Float64[np.ndarray, "n 4"], b: Float64[np.ndarray, "n 4"]) -> Vectors:

@@ -44,8 +44,7 @@ class Cleaner:
         Raises:
             LogError: more messages than were surveyed.
         """
-        n = len(batch.stamp_ns)
-        end = self._count + n
+        end = self._count + len(batch.stamp_ns)
         if end > self._survey.messages:
             raise LogError(
                 f"has more than the {self._survey.messages} messages of the first pass",

@@ -23,7 +23,7 @@ from imutool.cleaning.samples import STEP_S, Motion
 from imutool.cleaning.truth import Truth, axis_of_gravity, best_rotation, force_in_world, rotation_deg, stays_level, turning
 from imutool.cleaning.unit_evidence import RATES
 from imutool.geometry import quaternion
-from imutool.recording import GRAVITY_M_S2
+from imutool.recording import GRAVITY_M_S2, interpolate
 from imutool.recording.columns import median, quantile
 
 SECOND_AXIS = 0.15  # of the rate about the main axis, that about the second at least: more than a tilted mount leaks
@@ -248,8 +248,7 @@ class _Forces(NamedTuple):
 def _force_at_poses(step: Int64[np.ndarray, " m"], accel: Float64[np.ndarray, "m 3"], start_ns: int, truth: Truth) -> _Forces:
     at_ns, q_wb, a_w = force_in_world(truth)
     use, first_s, _ = usable(at_ns, at_ns + 1, start_ns, step)
-    f = np.stack([np.interp(first_s, STEP_S * (step + 0.5), column) for column in accel.T], axis=1)
-    return _Forces(first_s, q_wb[use], a_w[use], f)
+    return _Forces(first_s, q_wb[use], a_w[use], interpolate(first_s, STEP_S * (step + 0.5), accel))
 
 
 def _mean_vertical(forces: _Forces) -> float | None:

@@ -101,8 +101,7 @@ class Intervals:
         """Add the next samples, in order."""
         if not len(number):
             return
-        before = number[0] - JOIN - 1 if self._last is None else self._last
-        far = np.diff(number, prepend=before) > JOIN
+        far = np.diff(number, prepend=number[0] - JOIN - 1 if self._last is None else self._last) > JOIN
         if not far[0] and not self.left_out:  # goes on from the interval before
             part = stamp_ns[: int(np.argmax(far)) if far.any() else len(far)]
             first, last = self.intervals[-1]

@@ -50,8 +50,7 @@ def choose(errors: Float64[np.ndarray, "c n"], blocks: Int64[np.ndarray, " n"]) 
     ahead = sums[best] - sums
     error = ahead.std(axis=1, ddof=1) * np.sqrt(len(number))
     z = np.where(error > 0, ahead.sum(axis=1) / np.maximum(error, 1e-300), 0.0)
-    others = np.delete(z, best)
-    return Choice(best, float(others.min()), misfit, z < SURE)
+    return Choice(best, float(np.delete(z, best).min()), misfit, z < SURE)
 
 
 class Reading(NamedTuple):

@@ -106,8 +106,7 @@ class TopicSummary:
     @cached_property
     def conventions(self) -> Conventions:
         """Units, axes and frames that the motion shows."""
-        unit = accel_reading(self.motion).unit
-        return judge(self.motion, self.truth, FORCES.get(unit, 1.0))
+        return judge(self.motion, self.truth, FORCES.get(accel_reading(self.motion).unit, 1.0))
 
 
 class Rule(ABC):

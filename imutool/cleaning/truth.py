@@ -91,8 +91,7 @@ def truth_of(recording: Recording) -> Truth | None:
 def _thinned(stamp_ns: Int64[np.ndarray, " n"], last_ns: int) -> Int64[np.ndarray, " m"]:
     """First row of each 0.1 s after `last_ns`; rows that go back in time are left out."""
     step = stamp_ns // STEP_NS
-    before = np.maximum.accumulate(np.concatenate([[last_ns // STEP_NS], step]))[:-1]
-    return np.flatnonzero(step > before)
+    return np.flatnonzero(step > np.maximum.accumulate(np.concatenate([[last_ns // STEP_NS], step]))[:-1])
 
 
 def turning(

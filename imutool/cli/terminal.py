@@ -45,8 +45,7 @@ out, err = _Console(width=_width, emoji=False), _Console(stderr=True, emoji=Fals
 
 def plain(text: str) -> str:
     """Text without markup and without control characters, for a terminal."""
-    shown = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
-    return shown.replace("[", r"\[")
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text).replace("[", r"\[")
 
 
 def say(line: str, word: str = "", color: str = "yellow", *, to: Console = out) -> None:

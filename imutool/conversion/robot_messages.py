@@ -17,6 +17,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64, UInt8
 from imutool.errors import LogError
 from imutool.geometry import quaternion
+from imutool.geometry.quaternion import FLU_FROM_FRD
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
 from imutool.mcap_io.codec.reflection import Sample
@@ -26,10 +27,7 @@ from imutool.recording.message_log import MessageTopic, named_kind
 PACKAGE = "px4_msgs/msg/"
 WHOLE_IMUS, SINGLE_SENSORS = ("SensorCombined", "VehicleImu"), ("SensorGyro", "SensorAccel")
 PATH = "nav_msgs/msg/Path"
-FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
 ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-Q_ENU_FROM_NED_WXYZ = quaternion.of_matrix(ENU_FROM_NED)
-Q_FRD_FROM_FLU_WXYZ = np.array([[0.0, 1.0, 0.0, 0.0]])
 US, BODY, WORLD = 1000, "base_link", "map"  # ns; frames of ROS
 KNOWN_FRAMES = 1, 2  # of VehicleOdometry's poses: NED, and FRD with any heading
 NUMBERS = 7  # of a pose: position, then xyzw
@@ -70,9 +68,7 @@ class Px4:
         if self.kind == "VehicleOdometry":
             if number("pose_frame") not in KNOWN_FRAMES:
                 raise ValueError("the frame of the pose is not known")
-            q_wxyz = quaternion.multiply(Q_ENU_FROM_NED_WXYZ, vector("q", 4)[None])
-            turn = quaternion.multiply(q_wxyz, Q_FRD_FROM_FLU_WXYZ)[0]
-            values = np.concatenate([ENU_FROM_NED @ vector("position"), turn])
+            values = np.concatenate([ENU_FROM_NED @ vector("position"), quaternion.enu_from_ned(vector("q", 4)[None])[0]])
             return Sample((number("timestamp_sample") or number("timestamp")) * US, WORLD, values.tolist())
         if self.kind == "VehicleImu":  # the middle of what it integrates
             spans = np.array([number("delta_angle_dt"), number("delta_velocity_dt")]) * US

@@ -161,7 +161,7 @@ def _find(source: Path, format: str, out: Path) -> _Sequences:
             if claimed and is_general(module):
                 continue  # a data set's own converter knows more
             try:
-                if format != AUTO or module.recognises(sequence):
+                if format != AUTO or is_general(module) or module.recognises(sequence):
                     claimed.append(Job(key, sequence))
                 elif not claimed:
                     reason = DataError("no converter recognises it", where=str(sequence), fix="Choose one with `format`")

@@ -45,8 +45,7 @@ class Labels:
         known = {topic.name: schemas.canonical(topic.schema_name) for topic in content.topics}
         poses = [*content.poses, *(name for name, kind in known.items() if kind in POSES)]
         others = [name for name in content.counts if name not in known]  # an MCAP log's, which the writer judges as they come
-        made = [f"{name}/pose" for name in (*known, *others)]
-        self._check([*poses, *others], content.name, made)
+        self._check([*poses, *others], content.name, [f"{name}/pose" for name in (*known, *others)])
         return replace(content, kinds={**content.kinds, **dict(self.kinds)})
 
     def _with_pair(self, content: Recording | MessageLog, parts: tuple[str, str]) -> MessageLog:

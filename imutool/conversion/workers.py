@@ -154,8 +154,7 @@ def _convert_one(job: Job) -> Outcome:
         given = {} if job.mapping is None else {"mapping": job.mapping}
         if given and "mapping" not in inspect.signature(module.read_sequence).parameters:
             raise ConfigError(f"{job.converter} reads no tables", where="mapping", expected="a table")
-        content = module.read_sequence(job.sequence, images=job.images, **given)
-        return write_content(content, job)
+        return write_content(module.read_sequence(job.sequence, images=job.images, **given), job)
     except DataError as error:
         known = error.where is not None and str(job.sequence.path) in error.where
         where = str(job.sequence) if error.where is None else f"{job.sequence}: {error.where}"

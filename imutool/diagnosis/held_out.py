@@ -49,8 +49,7 @@ def with_constant(pair: AlignedLog, model: Float64[np.ndarray, "n k"]) -> Float6
 def noise_floor(logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, " k"]:
     """Noise standard deviation of a sample by axis; neighbours stand in for an unusable one."""
     count = np.sum([log.pair.axes for log in logs], axis=0)
-    total = np.sum([log.pair.axes * noise_std(log.whiten) ** 2 for log in logs], axis=0)
-    variance = total / np.maximum(count, 1.0)
+    variance = np.sum([log.pair.axes * noise_std(log.whiten) ** 2 for log in logs], axis=0) / np.maximum(count, 1.0)
     for signal, part in logs[0].pair.signals.items():
         known = count[part] > 0
         variance[part][~known] = variance[part][known].mean() if known.any() else MIN_NOISE[signal] ** 2

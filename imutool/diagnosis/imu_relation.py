@@ -18,7 +18,7 @@ from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.wording.quantity import Quantity, value
 from imutool.file_location import Location
 from imutool.mcap_io.log import Log
-from imutool.recording import Imu, Recording, seconds
+from imutool.recording import Imu, Recording, interpolate, seconds
 from imutool.sensor import catalogue
 from imutool.units import AXES
 
@@ -77,7 +77,7 @@ def imu_relation(first: Recording, other: Recording, effects: Sequence[str], set
 def _vectors(imu: Imu, t_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "m 3"]:
     """Angular rates without their mean, then specific forces, at some times; both parts of one size."""
     t_s, own_s = (seconds(times, int(imu.t_ns[0])) for times in (t_ns, imu.t_ns))
-    rates, forces = (np.stack([np.interp(t_s, own_s, x) for x in part.T], axis=1) for part in (imu.gyro, imu.accel))
+    rates, forces = (interpolate(t_s, own_s, part) for part in (imu.gyro, imu.accel))
     rates = rates - rates.mean(axis=0)
     return np.concatenate([part / max(float(np.linalg.norm(part)), 1e-12) for part in (rates, forces)])
 

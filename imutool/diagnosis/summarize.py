@@ -168,8 +168,7 @@ def _worthwhile(
     while weak := [k for k, f in enumerate(named) if f.share <= 0.0 or any(is_of_digits(f, other) for other in digits)]:
         minimum = min(weak, key=lambda k: named[k].share)
         idle += [named[minimum].effect] if named[minimum].share <= 0.0 else []
-        name = selection.selected[minimum].effect.key
-        selection = without(selection, {name})
+        selection = without(selection, {selection.selected[minimum].effect.key})
         named = [finding_of(logs, selection, selected, noise) for selected in selection.selected]
     return selection, named, idle
 

@@ -148,8 +148,7 @@ def to_noise_file(d: Diagnosis) -> Noise | None:
     if not d.traces:
         return None
     rate_hz = 1.0 / float(np.median([np.median(np.diff(trace.t_s)) for trace in d.traces]))
-    residual = np.concatenate([trace.real - trace.after for trace in d.traces])
-    std = np.nanstd(residual, axis=0)
+    std = np.nanstd(np.concatenate([trace.real - trace.after for trace in d.traces]), axis=0)
     if not (std > 0.0).all():
         return None
     names = ", ".join(dict.fromkeys(trace.log for trace in d.traces))

@@ -108,8 +108,7 @@ def _best_imu(log: Log) -> str:
         LogError: none, or several.
     """
     every = log.with_schema((schemas.IMU,))
-    derived = [t.name for t in every if t.is_derived]
-    found = derived or [t.name for t in every]
+    found = [t.name for t in every if t.is_derived] or [t.name for t in every]
     if len(found) != 1:
         what = f"the log has {len(found)} IMU topics: {', '.join(found)}" if found else "the log has no IMU"
         raise LogError(what, where=log.path, expected="one", fix="Choose one with `imu`" if found else "")

@@ -45,8 +45,7 @@ class Links:
     def to(self, name: str) -> str:
         """URL of a file, escaped."""
         if isinstance(self.page, Path) and isinstance(self.out, Path):
-            relative = os.path.relpath(self.out / name, self.page.parent.absolute())
-            return quote(Path(relative).as_posix())
+            return quote(Path(os.path.relpath(self.out / name, self.page.parent.absolute())).as_posix())
         return quote(str(self.out / name), safe="/:")
 
 

@@ -20,6 +20,7 @@ Vectors = Float64[np.ndarray, "n 3"]
 Column = Float64[np.ndarray, " n"]
 OneOrMany = Float64[np.ndarray, "#n 4"]
 NED_FROM_ENU: Quaternions = np.array([[0.0, 0.5**0.5, 0.5**0.5, 0.0]])  # half a turn about north-east, so also ENU from NED
+FLU_FROM_FRD: Float64[np.ndarray, "3"] = np.array([1.0, -1.0, -1.0])  # half a turn about x, so also FRD from FLU
 
 ROWS_AT_ONCE = 1 << 13  # whose steps stay in a core's cache
 Rows = TypeVar("Rows", bound=np.ndarray)
@@ -174,3 +175,14 @@ def roll_pitch_yaw(q: Quaternions) -> Vectors:
     pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
     yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return np.stack([roll, pitch, yaw], axis=1)
+
+
+def of_roll_pitch_yaw(angles: Vectors) -> Quaternions:
+    """Quaternions of R_z(yaw) R_y(pitch) R_x(roll) (rad); zeros where an angle is missing."""
+    about = [exp(axis * angle[:, None]) for axis, angle in zip(np.eye(3), np.nan_to_num(angles).T, strict=True)]
+    return np.where(np.isfinite(angles).all(axis=1)[:, None], multiply(about[2], multiply(about[1], about[0])), 0.0)
+
+
+def enu_from_ned(q: Quaternions) -> Quaternions:
+    """Orientations of the body FLU in ENU, from those of the body FRD in NED."""
+    return multiply(multiply(NED_FROM_ENU, q), np.array([[0.0, 1.0, 0.0, 0.0]]))

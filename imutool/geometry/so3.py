@@ -71,8 +71,7 @@ def hat(v: Vectors) -> Rotations:
     """Skew matrix [v]x with [v]x a = v x a."""
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)
-    flat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
-    return flat.reshape(*v.shape[:-1], 3, 3)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*v.shape[:-1], 3, 3)
 
 
 def exp(xi: Vectors) -> Rotations:

@@ -72,8 +72,7 @@ def dead_reckon(
     if not len(imu):
         raise DataError("the IMU has no samples", expected="at least one")
     q_0, p_0, v_0 = (np.asarray(part, dtype=np.float64) for part in start)
-    t = seconds(imu.t_ns, int(imu.t_ns[0]))
-    dt = np.diff(t)[:, None]
+    dt = np.diff(seconds(imu.t_ns, int(imu.t_ns[0])))[:, None]
     with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below with its row
         q_wb = quaternion.running_product(np.concatenate([quaternion.unit(q_0[None]), quaternion.exp(imu.gyro[:-1] * dt)]))
         q_wb /= quaternion.length(q_wb)[:, None]  # in place, as below: few arrays as long as the log at once

@@ -16,7 +16,7 @@ from scipy.stats import beta
 from imutool.array_types import Bool, Complex128, Float64
 from imutool.config import Settings
 from imutool.inertial.stationary import CALM, nothing_but_noise, white_noise
-from imutool.recording import Imu, seconds
+from imutool.recording import Imu, interpolate, seconds
 
 MOSTLY = 2.0  # times the noise: less is noise for the most part
 OVERLAP = 4  # windows begin a quarter of a window apart
@@ -161,7 +161,7 @@ def _drift_s(
     if len(at) < MIN_SAMPLES or not np.ptp(gyro, axis=0).all():
         return np.zeros(len(own_s))
     slow = butter(2, min(SLOW_HZ, 0.4 * rate_hz), fs=rate_hz, output="sos")
-    read = sosfiltfilt(slow, np.stack([np.interp(at, own_s, column) for column in recorded.T], axis=1), axis=0)
+    read = sosfiltfilt(slow, interpolate(at, own_s, recorded), axis=0)
     rate, line, squares = make_interp_spline(t_s, sosfiltfilt(slow, gyro, axis=0), k=3), np.zeros(2), []
     since = np.column_stack([np.ones(len(at)), (at - at.mean()) / np.ptp(at)])
     for _ in range(STEPS):
@@ -209,8 +209,7 @@ def _top_power(parts: Parts, settings: WienerSettings) -> Float64[np.ndarray, " 
 
 def _apart(shared: Bool[np.ndarray, "f ..."], settings: WienerSettings) -> Bool[np.ndarray, "f ..."]:
     """Frequencies away from those that are shared."""
-    near = maximum_filter1d(shared, 2 * APART * settings.short_time_parts + 1, axis=0, mode="nearest")
-    return np.asarray(~near)
+    return np.asarray(~maximum_filter1d(shared, 2 * APART * settings.short_time_parts + 1, axis=0, mode="nearest"))
 
 
 def _shared(

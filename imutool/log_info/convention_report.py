@@ -51,11 +51,6 @@ NO_DELAY = "the sizes of the turns show no single delay: few poses, or turns tha
 NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or a vehicle's own acceleration"
 
 
-def convention_summary(imu: Imu, truth: Truth | None) -> TopicSummary:
-    """Totals for the rules about conventions; nothing is converted."""
-    return motion_of(imu).summary(truth)
-
-
 def defect_warnings(imu: Imu, whole: TopicSummary) -> list[str]:
     """Warning of axes that stand still or are clipped, of an IMU whose sensors both change."""
     stuck, saturation = Stuck(), Saturation()

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from imutool.cleaning.rule import CleaningSettings, TopicSummary
+from imutool.cleaning.rules.units import Units
 from imutool.cleaning.samples import BLOCK, Motion, Samples
-from imutool.cleaning.truth import Truth
+from imutool.cleaning.truth import Truth, truth_of
 from imutool.log_info.pose_imu_rotation import GyroTurns
-from imutool.recording import Imu
+from imutool.recording import Imu, Recording
 
 
 class ImuMotion:
@@ -57,3 +59,14 @@ def blocks_of(imu: Imu) -> Iterator[Samples]:
         s = slice(first, first + BLOCK)
         t_ns, values = imu.t_ns[s], np.concatenate([imu.gyro[s], imu.accel[s]], axis=1)
         yield Samples(first + np.arange(len(t_ns)), t_ns, t_ns, values)
+
+
+def in_si_units(recording: Recording) -> tuple[Recording, list[str]]:
+    """Recording in rad/s and m/s², and sentences on units that were converted or are in doubt."""
+    imu = recording.imu
+    whole = replace(motion_of(imu).summary(truth_of(recording)), settings=CleaningSettings())
+    found = [finding for finding in Units().findings(whole) if finding.severity != "note"]
+    texts = [finding.what + (", converted" if finding.action == "converted" else "") for finding in found]
+    if (whole.scale == 1.0).all():
+        return recording, texts
+    return replace(recording, imu=Imu(imu.t_ns, imu.gyro * whole.scale[:3], imu.accel * whole.scale[3:])), texts

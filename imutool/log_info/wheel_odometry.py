@@ -26,7 +26,7 @@ from imutool.inertial.aids import WHEELS, Aids, Odometry
 from imutool.inertial.preintegration import hat
 from imutool.inertial.scoring.alignment import align
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
-from imutool.log_info.convention_report import convention_summary
+from imutool.log_info.imu_motion import motion_of
 from imutool.log_info.pose_coverage import coverage
 from imutool.log_info.pose_imu_rotation import agreement, motion_warnings, unlike
 from imutool.mcap_io.codec.schemas import MESSAGE_TWISTS, TF
@@ -94,7 +94,7 @@ def _on_clock(poses: Poses, imu: Imu, name: str) -> tuple[Poses, float]:
     slow = of_poses(name, poses, WHEELS)
     if slow is None:
         return poses, 0.0
-    delay = pose_delay(convention_summary(imu, slow).motion, slow)
+    delay = pose_delay(motion_of(imu).motion, slow)
     if delay is not None and delay.step is not None:
         before, after, _ = delay.step
         what = f"{name} is first {lateness(before)}, then {lateness(after)}, by the gyro"
@@ -144,8 +144,7 @@ def _dead_reckoned(log: Log, name: str, imu: Imu) -> Poses:
     if len(t_ns) < 2:
         raise DataError(f"{name} has {len(t_ns)} twists while the IMU measures", expected="two or more")
     dt = np.diff(seconds(t_ns, int(t_ns[0])), prepend=0.0)
-    yaw = np.cumsum(dt * values[:, 3])
-    q = quaternion.exp(yaw[:, None] * np.array([0.0, 0.0, 1.0]))
+    q = quaternion.exp(np.cumsum(dt * values[:, 3])[:, None] * np.array([0.0, 0.0, 1.0]))
     v = quaternion.rotate(q, values[:, :3])
     return Poses(t_ns, np.cumsum(dt[:, None] * v, axis=0), q, v)
 

@@ -75,8 +75,7 @@ def with_temperatures(
     recordings: Sequence[Recording], log: Log, start_ns: int | None = None, end_ns: int | None = None
 ) -> list[Recording]:
     """Recordings of a log with the temperatures (`temperatures`) that are no scalar topic."""
-    known = set().union(*(recording.scalars for recording in recordings))
-    found = temperatures(log, known, start_ns, end_ns)
+    found = temperatures(log, set().union(*(recording.scalars for recording in recordings)), start_ns, end_ns)
     return [replace(recording, scalars={**recording.scalars, **found}) for recording in recordings] if found else [*recordings]
 
 

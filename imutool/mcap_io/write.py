@@ -154,8 +154,7 @@ def chunks(group: Sequence[Series]) -> Iterator[Chunk]:
         for index, series in enumerate(group):
             own_bytes = offsets[which[first:last] == index]
             if len(own_bytes):
-                rows = series.records(slice(done[index], done[index] + len(own_bytes)))
-                messages.scatter(data, own_bytes, rows)
+                messages.scatter(data, own_bytes, series.records(slice(done[index], done[index] + len(own_bytes))))
                 done[index] += len(own_bytes)
         channels = np.array([series.channel for series in group], np.uint16)[which[first:last]]
         yield Chunk(data.tobytes(), channels, times[first:last], offsets)

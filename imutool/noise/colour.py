@@ -160,8 +160,7 @@ def _spread(
 ) -> tuple[Float64[np.ndarray, "f k"], Float64[np.ndarray, " k"]]:
     """Principal factors of the levels, and the spread that each has alone, without that of a finite window."""
     covariance = np.cov(rest.T)
-    variance = np.diag(covariance)
-    known = covariance - np.diag(np.minimum(sampling, variance))
+    known = covariance - np.diag(np.minimum(sampling, np.diag(covariance)))
     values, vectors = np.linalg.eigh(known)
     factors = (vectors[:, -FACTORS:] * np.sqrt(np.maximum(values[-FACTORS:], 0.0))).T
     return factors, np.sqrt(np.maximum(np.diag(known) - (factors**2).sum(axis=0), 0.0))

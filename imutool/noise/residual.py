@@ -82,8 +82,7 @@ def _starts(count: int, n: int, hop: int, broken: Int64[np.ndarray, " n"]) -> In
     """First samples of windows of n steps that touch no gap; of more than enough, runs of neighbours all over the log."""
     first = np.arange(0, max(count - n, 0), hop)
     if len(first) > MAX_WINDOWS:
-        runs = MAX_WINDOWS // RUN
-        begin = np.linspace(0, len(first) - RUN, runs).astype(int)
+        begin = np.linspace(0, len(first) - RUN, MAX_WINDOWS // RUN).astype(int)
         first = first[np.unique((begin[:, None] + np.arange(RUN)).ravel())]
     kept: Int64[np.ndarray, " m"] = first[broken[first + n] == broken[first]]
     return kept

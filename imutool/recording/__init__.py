@@ -113,10 +113,9 @@ class Poses(Columns):
 
         start = int(self.t_ns[0])
         knots, wanted = seconds(self.t_ns, start), seconds(clipped, start)
-        share = (clipped - self.t_ns[after - 1]) / span_ns
-        q_wb_wxyz = quaternion.between_rows(self.q_wb_wxyz, after, share)
-        p_wb = _interpolate(wanted, knots, self.p_wb)
-        v_w = None if self.v_w is None else _interpolate(wanted, knots, self.v_w)
+        q_wb_wxyz = quaternion.between_rows(self.q_wb_wxyz, after, (clipped - self.t_ns[after - 1]) / span_ns)
+        p_wb = interpolate(wanted, knots, self.p_wb)
+        v_w = None if self.v_w is None else interpolate(wanted, knots, self.v_w)
         for column in (q_wb_wxyz, p_wb, *([] if v_w is None else [v_w])):  # so that the poses need no copy
             column.flags.writeable = False
         return Poses(t_ns, p_wb, q_wb_wxyz, v_w), valid
@@ -287,14 +286,14 @@ def unit_quaternions(q_wxyz: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, 
         DataError: a norm differs from one by more than 0.01; the message names the row.
     """
     norm = np.linalg.norm(q_wxyz, axis=1)
-    bad = ~(np.abs(norm - 1.0) <= 0.01)
-    if bad.any():
+    if (bad := ~(np.abs(norm - 1.0) <= 0.01)).any():
         row = int(np.argmax(bad))
         raise DataError(f"quaternion {q_wxyz[row].tolist()} in row {row} has norm {norm[row]:.6g}", expected="norm 1")
     return np.where(np.abs(norm - 1.0)[:, None] <= 1e-9, q_wxyz, q_wxyz / norm[:, None])
 
 
-def _interpolate(
+def interpolate(
     t: Float64[np.ndarray, " n"], knots: Float64[np.ndarray, " m"], values: Float64[np.ndarray, "m k"]
 ) -> Float64[np.ndarray, "n k"]:
+    """Columns along straight lines between knots; beyond them the first and the last row."""
     return np.stack([np.interp(t, knots, column) for column in values.T], axis=1)

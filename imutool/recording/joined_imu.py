@@ -14,7 +14,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
 from imutool.geometry import quaternion
-from imutool.recording import Imu
+from imutool.recording import Imu, interpolate
 from imutool.recording.columns import longest_run
 from imutool.recording.sample_order import Cleaned, in_order
 
@@ -232,8 +232,7 @@ def joined(
     limit = MAX_GAP_PERIODS * float(np.median(periods))
     inside = (rates.t_ns >= forces.t_ns[0]) & (rates.t_ns <= forces.t_ns[-1]) & (periods[after - 1] <= limit)
     start = forces.t_ns[0]
-    t, knots = (rates.t_ns[inside] - start).astype(float), (forces.t_ns - start).astype(float)
-    accel_there = np.stack([np.interp(t, knots, column) for column in forces.values.T], axis=1)
+    accel_there = interpolate((rates.t_ns[inside] - start).astype(float), (forces.t_ns - start).astype(float), forces.values)
     rate_hz = [1e9 / float(np.median(np.diff(c.t_ns))) for c in (rates, forces)]
     notes.append(
         f"{name}: gyro at {rate_hz[0]:.1f} Hz and accelerometer at {rate_hz[1]:.1f} Hz became one IMU on the gyro's stamps, "

@@ -12,6 +12,7 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.noise import datasheet
+from imutool.recording import interpolate
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.effects.temperature import NO_CHANNEL
 from imutool.sensor.samples import SensorSamples
@@ -54,8 +55,7 @@ def factor(word: str) -> Variable | None:
     for pattern, change in CHANGES:
         found = re.fullmatch(pattern, word)
         if found and found[1] in VARIABLES:
-            power = float(found[2]) if found.lastindex == 2 else 1.0
-            return _Factor(VARIABLES[found[1]], change, power)
+            return _Factor(VARIABLES[found[1]], change, float(found[2]) if found.lastindex == 2 else 1.0)
     return None
 
 
@@ -120,7 +120,7 @@ def curve(label: str, signal: Sensor, variable: str, x: Float64[np.ndarray, " k"
 
     def forward(samples: SensorSamples, _: Theta) -> SensorSamples:
         at = _channel(samples, variable) if of is None else of(samples)
-        return samples.with_added(signal, np.stack([np.interp(at, x, column) for column in y.T], axis=1))
+        return samples.with_added(signal, interpolate(at, x, y))
 
     needs = () if of is not None else (variable,)
     equation = f"{signal} += curve({variable})"

@@ -57,15 +57,13 @@ class Sampler:
             first = [np.zeros((len(motion.t_s), 0))] if motion.R_wb is None else [motion.R_wb.reshape(-1, 9)]
             return np.concatenate([*first, *(values[:, None] for values in motion.channels.values())], axis=1)
 
-        both = self._others.made(motion.R_wb, motion.channels, columns)
-        return self._at_instants(both, instants)
+        return self._at_instants(self._others.made(motion.R_wb, motion.channels, columns), instants)
 
     def _at_instants(self, x: Float64[np.ndarray, "n k"], instants: Instants) -> Float64[np.ndarray, "m k"]:
         weights = instants[2]
         if isinstance(weights, slice):
             return self._values.made(x, instants, lambda: x[weights])
-        coefficients = self._coefficients.changed(x, None, _coefficients)
-        return self._values.changed(coefficients, instants, weights.__matmul__)
+        return self._values.changed(self._coefficients.changed(x, None, _coefficients), instants, weights.__matmul__)
 
     def _at(self, t_s: Times, taken_s: Float64[np.ndarray, " m"]) -> Instants:
         """Clock, instants, and matrix from coefficients to values, or the rows of the clock's own instants.
@@ -141,8 +139,7 @@ def _weights(t_s: Float64[np.ndarray, " n"], taken_s: Float64[np.ndarray, " m"])
         raise DataError(f"the clock of the motion is {off[row]:.3g} s off in row {row}", expected="an even clock")
     at = np.clip((taken_s - t_s[0]) / period_s, 0.0, n - 1.0)
     first = np.minimum(at.astype(np.int32), n - 2)
-    values = np.empty((len(at), 4))
-    u = at - first
+    values, u = np.empty((len(at), 4)), at - first
     for x, end, inner in ((u, 3, 1), (1.0 - u, 0, 2)):  # products: a cube by `**` takes five times as long
         values[:, end] = x * x * x / 6.0
         values[:, inner] = 2.0 / 3.0 - x * x * (1.0 - 0.5 * x)
@@ -294,6 +291,8 @@ class SensorSamples:
 
     def with_added(self, sensor: Sensor, added: Vectors) -> SensorSamples:
         """The samples with something added to one sensor."""
-        if sensor == "gyro":
-            return self.with_readings(gyro=self.gyro + added)
-        return self.with_readings(accel=self.accel + added)
+        return self.with_readings(**{sensor: getattr(self, sensor) + added})
+
+    def with_gain(self, sensor: Sensor, error: Vectors | Float64[np.ndarray, "3"]) -> SensorSamples:
+        """The samples of one sensor times one plus a gain's error."""
+        return self.with_readings(**{sensor: getattr(self, sensor) * (1.0 + error)})

@@ -181,8 +181,7 @@ class SignalFilter:
             columns[:, SLOW] = slow = low_pass(u, gain[0], self._slow)
             columns[:, TURN] = low_pass(gyro, gain[6], self._turn)
             # the mean before the sample: one filter waits for none
-            around = np.concatenate([self._slow[None, 3:], slow[:-1, 3:]])
-            fast = columns[:, ACCEL] - around
+            fast = columns[:, ACCEL] - np.concatenate([self._slow[None, 3:], slow[:-1, 3:]])
             columns[:, VIBRATION] = low_pass(fast**2, gain[9], self._power)
         if self._loads:
             load = _loads(gyro, columns[:, ACCEL], fast)

@@ -200,8 +200,7 @@ def _smoothed(poses: Poses, passes: int) -> SmoothMotion:
 def _unbroken(t_s: Times) -> list[tuple[int, int]]:
     """Row ranges between holes."""
     edges = np.flatnonzero(np.diff(t_s) > MAX_GAP_S) + 1
-    ends = [0, *edges.tolist(), len(t_s)]
-    return [(a, b) for a, b in pairwise(ends) if b > a]
+    return [(a, b) for a, b in pairwise([0, *edges.tolist(), len(t_s)]) if b > a]
 
 
 def _fitted(t_s: Times, y: Values, passes: int) -> tuple[Penalised, Times]:
@@ -295,5 +294,4 @@ def _step_size(t_s: Times, y: Values, at: Int64[np.ndarray, " s"], k: int) -> Fl
     t = (t_s[a:b] - t_s[k]) / (t_s[b - 1] - t_s[a])
     near = [k, *[int(other) for other in at if a < other < b and other != k]]
     columns = [t**power for power in range(4)] + [(np.arange(a, b) >= row).astype(np.float64) for row in near]
-    solution = np.linalg.lstsq(np.stack(columns, axis=1), y[a:b], rcond=None)[0]
-    return np.asarray(solution[4])
+    return np.asarray(np.linalg.lstsq(np.stack(columns, axis=1), y[a:b], rcond=None)[0][4])

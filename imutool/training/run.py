@@ -176,8 +176,7 @@ def _physics_first(
     if physics.model.config.remainder and len(recordings) > 1:  # a single log shows what fits its own motion
         shared = with_poses_of_sensor(physics.recordings, [fit.own for fit in physics.fits.values()])
         before = descent(shared, static.Model.method, alone, statistics=False)
-        of_ode = physics.ode_settings(settings)
-        ode = descent(shared, neural_ode.Model.method, of_ode, constant, statistics=False)
+        ode = descent(shared, neural_ode.Model.method, physics.ode_settings(settings), constant, statistics=False)
         held_out = {"effects": before.errors(), "effects and neural_ode": ode.errors()}
         kept = ode if helps(*(_log_errors(training) for training in (before, ode))) else before
     if kept.turn_on is None:

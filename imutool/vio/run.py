@@ -189,8 +189,7 @@ def from_first_pose(estimate: Poses, truth: Poses) -> Poses:
     turn = Rotation.from_rotvec([0.0, 0.0, 2.0 * np.arctan2(z, w)])
     turned = (turn * Rotation.from_quat(estimate.q_wb_wxyz, scalar_first=True)).as_quat(scalar_first=True)
     p_wb = (estimate.p_wb - estimate.p_wb[0]) @ turn.as_matrix().T + truth.p_wb[0]
-    v_w = None if estimate.v_w is None else estimate.v_w @ turn.as_matrix().T
-    return Poses(estimate.t_ns, p_wb, turned, v_w)
+    return Poses(estimate.t_ns, p_wb, turned, None if estimate.v_w is None else estimate.v_w @ turn.as_matrix().T)
 
 
 def _keyframes(t_ns: Int64[np.ndarray, " n"], rate_hz: float) -> Int64[np.ndarray, " k"]:
@@ -198,8 +197,7 @@ def _keyframes(t_ns: Int64[np.ndarray, " n"], rate_hz: float) -> Int64[np.ndarra
     count = int((t_ns[-1] - t_ns[0]) * 1e-9 * rate_hz + 1e-6) + 1
     wanted = t_ns[0] + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
     after = np.clip(np.searchsorted(t_ns, wanted), 1, len(t_ns) - 1)
-    nearest = np.where(wanted - t_ns[after - 1] <= t_ns[after] - wanted, after - 1, after)
-    return np.unique(nearest)
+    return np.unique(np.where(wanted - t_ns[after - 1] <= t_ns[after] - wanted, after - 1, after))
 
 
 def _within(progress: Tell | None, done: int, total: int, word: str) -> Callable[[int, int], None] | None:

@@ -16,10 +16,8 @@ from support.evo import statistics
 from support.nees import consistency
 
 from imutool.errors import ConfigError, DataError, NumericsError
-from imutool.inertial.metrics import absolute, evaluate, write_tum
-from imutool.inertial.scoring.absolute_errors import AbsoluteErrors
+from imutool.inertial.metrics import AbsoluteErrors, absolute, evaluate, pairs_by_distance, write_tum
 from imutool.inertial.scoring.alignment import align
-from imutool.inertial.scoring.relative_errors import pairs_by_distance
 from imutool.recording import Poses
 
 EVO_TOLERANCE = 1e-9  # measured 4e-16; the same formulas in double precision, summed in another order

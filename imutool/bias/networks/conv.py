@@ -94,8 +94,7 @@ class Net(nn.Module):
     def _inference_output(self, u: Float[Tensor, "batch n 6"]) -> Float[Tensor, "batch n 3"]:
         x = (u / self.scale).mT
         for weight, offset, dilation in self.folded():
-            reach = (weight.shape[2] - 1) * dilation
-            y = functional.conv1d(causal(x, reach), weight, offset, dilation=dilation)
+            y = functional.conv1d(causal(x, (weight.shape[2] - 1) * dilation), weight, offset, dilation=dilation)
             x = functional.gelu(y) - functional.gelu(offset)[:, None]
         return (self.unit * (self.out @ x)).mT
 

@@ -47,8 +47,7 @@ class Network(BiasNetwork):
 
     def take(self, sensor: Sensor, names: Sequence[str], theta: Float[Tensor, " p"], covariance: Float[Tensor, "p p"]) -> None:
         """Take over effects and their fitted parameters, in the order of `names`."""
-        key = f"{sensor}_effects"
-        self.config = msgspec.structs.replace(self.config, **{key: tuple(names)})
+        self.config = msgspec.structs.replace(self.config, **{f"{sensor}_effects": tuple(names)})
         self._set_effects(sensor, tuple(names))
         with torch.no_grad():
             getattr(self, f"theta_{sensor}").copy_(theta)

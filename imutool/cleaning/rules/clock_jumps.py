@@ -34,8 +34,7 @@ class ClockJumps(Rule):
 
     def see(self, samples: Samples) -> None:
         """Record median delay, scatter and largest change of each part."""
-        table = np.column_stack([samples.number, samples.stamp_ns, samples.log_ns])
-        self._waiting.append(table)
+        self._waiting.append(np.column_stack([samples.number, samples.stamp_ns, samples.log_ns]))
         rows = np.concatenate(self._waiting)
         first = 0
         while len(rows) - first >= PART:

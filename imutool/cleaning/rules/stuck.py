@@ -95,8 +95,7 @@ class _Axis:
         ends = np.concatenate([starts, [len(values)]])
         if ends[0]:  # goes on from the block before
             self._take(samples, 0, int(ends[0]), new=False)
-        lengths = np.diff(ends)
-        long = np.flatnonzero(lengths >= AXIS_MIN)
+        long = np.flatnonzero(np.diff(ends) >= AXIS_MIN)
         for start, end in [(int(starts[i]), int(ends[i + 1])) for i in long if i + 1 < len(starts)]:
             self._take(samples, start, end, new=True)
         if len(starts):

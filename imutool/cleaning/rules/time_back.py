@@ -189,8 +189,7 @@ def _ahead(stamp_ns: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     n = len(stamp_ns)
     if n < 3 or (np.diff(stamp_ns) > 0).all():
         return np.zeros(n, bool)
-    filled = np.concatenate([stamp_ns, np.full(AHEAD, 2**63 - 1)])
-    later = sliding_window_view(filled, AHEAD + 1)[:n, 1:]
+    later = sliding_window_view(np.concatenate([stamp_ns, np.full(AHEAD, 2**63 - 1)]), AHEAD + 1)[:n, 1:]
     behind: Int64[np.ndarray, " n"] = (later <= stamp_ns[:, None]).sum(axis=1)
     following = np.minimum(AHEAD, n - 1 - np.arange(n))
     ahead: Bool[np.ndarray, " n"] = (behind >= 2) & (2 * behind > following)

@@ -14,11 +14,10 @@ import numpy as np
 from imutool.diagnosis.audit.bandwidth import max_filter_delays
 from imutool.diagnosis.audit.faults import FAULTS, FaultFound, found
 from imutool.diagnosis.audit.motion import KinematicFit, Kinematics, kinematic_fit, kinematics, units
-from imutool.diagnosis.audit.motion_faults import motion_faults, unexplained
+from imutool.diagnosis.audit.motion_faults import CERTAIN, motion_faults, unexplained
 from imutool.diagnosis.audit.noise import Expected, noise_faults
 from imutool.diagnosis.audit.simulation import AT_BODY, Mount, read_simulation
 from imutool.diagnosis.audit.spectral_lines import SpectralLine, by_differences, spectral_lines
-from imutool.diagnosis.audit.timing import CERTAIN
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.wording.quantity import grouped
 from imutool.errors import DataError, ImutoolError

@@ -60,8 +60,7 @@ def read_simulation(
         topic = next(iter(recording.truths))
         world, body = _pose_frames(log, topic)
         mount = _stated_mount(_static_transforms(log), _imu_frame(log, recording.imu_topic), world, body)
-    down = "ned" in re.split(r"[^a-z0-9]+", world.lower())
-    moved = _of_sensor(recording.truths[topic], mount, down=down)
+    moved = _of_sensor(recording.truths[topic], mount, down="ned" in re.split(r"[^a-z0-9]+", world.lower()))
     return replace(recording, truths={**recording.truths, topic: moved}), mount
 
 

@@ -209,8 +209,7 @@ def ridge_fit(
     """Ridge fit of y by columns on some rows, evaluated on all rows."""
     size = np.linalg.norm(A[rows], axis=0)
     A = A[:, size > 0] / size[size > 0]
-    N = A[rows].T @ A[rows] + RIDGE * np.eye(A.shape[1])
-    return np.asarray(A @ np.linalg.solve(N, A[rows].T @ y[rows]))
+    return np.asarray(A @ np.linalg.solve(A[rows].T @ A[rows] + RIDGE * np.eye(A.shape[1]), A[rows].T @ y[rows]))
 
 
 def _rich(pair: Pair, candidates: Sequence[Effect], band: Band) -> list[Float64[np.ndarray, "_ m"]]:

@@ -125,8 +125,7 @@ def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Find
         return []
     signal = next(iter(lsb)) if len(lsb) == 1 else "both"
     parameters = {f"{name}_lsb": Estimate(value, 1e-3 * value, UNITS[name]) for name, value in lsb.items()}
-    length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
-    held_out = HeldOut(0.0, 0.0, "-", round(length, 1))
+    held_out = HeldOut(0.0, 0.0, "-", round(sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs), 1))
     return [Finding("quantization", signal, 0.0, 0.0, 0.0, parameters, "values are multiples of an LSB", held_out)]
 
 

@@ -275,8 +275,7 @@ def settled(usable: Bool[np.ndarray, " n"], order: int) -> Bool[np.ndarray, " n"
     """Rows whose last `order` rows count as well."""
     if not order:
         return usable
-    run = lfilter(np.ones(order + 1), [1.0], usable.astype(float))
-    return np.asarray(run > order + 0.5)
+    return np.asarray(lfilter(np.ones(order + 1), [1.0], usable.astype(float)) > order + 0.5)
 
 
 def burg(x: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"], order: int) -> Float64[np.ndarray, " _"]:

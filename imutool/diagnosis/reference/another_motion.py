@@ -94,8 +94,7 @@ def with_twins(known: Sequence[Finding], sim: Selection, real: Selection) -> tup
         return tuple(known)
     rivals = {e.key for e, _ in chosen[always:] if any(_is_rival(e, x.effect) for x in asked)}
     others = tuple(entry for entry in chosen if entry[0].key not in rivals)
-    begun = (*others, *((x.effect, x.theta) for x in asked))
-    whole = fit(logs, begun, part="all")
+    whole = fit(logs, (*others, *((x.effect, x.theta) for x in asked)), part="all")
     theta, std = _numbers(whole)
     new = tuple(SelectedEffect(x.effect, theta[x.effect.key], std[x.effect.key], (), 1.0, 1.0, 0.0) for x in asked)
     selection = Selection(new, fit(sim.fitted.logs, whole.chosen), whole, sim.tried, always)

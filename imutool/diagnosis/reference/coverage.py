@@ -96,8 +96,7 @@ def without_unseen_offset(candidates: Sequence[Effect], pairs: Sequence[Pair]) -
     What alignment by the motion leaves of it is no finding, but a filter or a delay cannot be fitted without it.
     """
     offset = tuple(e for e in candidates if e.name == "clock_offset" and any(pair.aligned_s for pair in pairs))
-    kept = tuple(e for e in candidates if e not in offset)
-    return kept, tuple((e, e.null_value.astype(float)) for e in offset)
+    return tuple(e for e in candidates if e not in offset), tuple((e, e.null_value.astype(float)) for e in offset)
 
 
 def clock_difference(pairs: Sequence[Pair], found: Fit) -> ClockDifference | None:

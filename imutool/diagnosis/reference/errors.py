@@ -117,8 +117,7 @@ def _where(
     p_value: float,
     shock: bool,
 ) -> Located:
-    power = (white[inside] ** 2).mean(axis=0)
-    axes = tuple(axis for axis, value in zip(AXES, power, strict=True) if value > 1.3)
+    axes = tuple(axis for axis, value in zip(AXES, (white[inside] ** 2).mean(axis=0), strict=True) if value > 1.3)
     own = "shocks of the recording" if shock else "the reference's own moments"
     return Located(signal, axes or AXES, tuple(runs), f"no regime: {own}", share, p_value, extent="intermittent")
 
@@ -209,8 +208,7 @@ def turned_reference(logs: Sequence[WhitenedImu], chosen: Chosen, settings: Refe
     if chi2.sf(off @ np.linalg.solve(C_both, off), 3) > settings.p_value:
         return []
     parameters = {f"turned_{axis}": Estimate(float(a), float(s), "rad") for axis, a, s in zip(AXES, turned, std, strict=True)}
-    seconds = round(len(residual) * settings.turned_block_s, 1)
-    held_out = HeldOut(0.0, 0.0, ASCII_UNITS["gyro"], seconds)
+    held_out = HeldOut(0.0, 0.0, ASCII_UNITS["gyro"], round(len(residual) * settings.turned_block_s, 1))
     return [Finding("reference_error", "both", share, p_value, p_value, parameters, "R_ref = R_wb Exp(turned)", held_out)]
 
 

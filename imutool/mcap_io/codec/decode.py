@@ -123,8 +123,7 @@ def _stamp(rows: UInt8[np.ndarray, "n L"], layout: Layout, which: int = 0) -> In
 
 def _numbers(rows: UInt8[np.ndarray, "n L"], layout: Layout, columns: slice, which: int = 0) -> Float64[np.ndarray, "n k"]:
     at = layout.numbers[which][0] + 8 * columns.start
-    cut = rows[:, at : at + 8 * (columns.stop - columns.start)]
-    return cut.view(layout.order + "f8").astype(np.float64)
+    return rows[:, at : at + 8 * (columns.stop - columns.start)].view(layout.order + "f8").astype(np.float64)
 
 
 def _one_layout(rows: UInt8[np.ndarray, "n L"], schema_name: str, encoding: str) -> Layout:

@@ -266,8 +266,7 @@ def _pose(tree: Tree, form: Format) -> Reflected | None:
     for path, name, node in fields:
         if not (isinstance(node, Mapping) and re.fullmatch(ORIENTATION, name)):
             continue
-        beside = [field for field in fields if field[0][:-1] == path[:-1]]
-        position = _vector(beside, POSITION)
+        position = _vector([field for field in fields if field[0][:-1] == path[:-1]], POSITION)
         parts = next(([f"{q}{axis}" for axis in "wxyz"] for q in ("", "q") if {f"{q}{a}" for a in "wxyz"} <= node.keys()), None)
         if position is not None and parts is not None:
             frame = next((p for p, text, kind in fields if kind == TEXT and re.fullmatch(FRAME, text)), None)

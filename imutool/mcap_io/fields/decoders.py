@@ -153,8 +153,7 @@ class Described:
 
         def look(raw: bytes) -> tuple[Sequence[tuple[int, bytes]], tuple[dict[str, Leaf], str]]:
             walk = self._walk(raw)
-            places = _places(walk, paths)
-            return walk.constants, (places, walk.order)
+            return walk.constants, (_places(walk, paths), walk.order)
 
         for rows, (places, order) in schemas.stretches(payload, look):
             cut = payload[rows]

@@ -293,8 +293,7 @@ class Recordings:
         open_ids = {i for i in used if len(topics_of(i, pool)) > 1}
         if not open_ids:  # of two definitions of one topic the proven holds
             return max(pool, key=lambda r: (len(used & r.readable()), sum((int(Opcode.CHANNEL), i) in r.proven for i in used)))
-        fitting = [r for r in pool if all(self._fits(found.block, i, r) for i in open_ids)]
-        pool = fitting or pool
+        pool = [r for r in pool if all(self._fits(found.block, i, r) for i in open_ids)] or pool
         if still := {i: " or ".join(sorted(topics)) for i in open_ids if len(topics := topics_of(i, pool)) > 1}:
             self.unproven[found.block.offset] = still
         return max(pool, key=lambda r: len(used & r.readable()))

@@ -263,8 +263,7 @@ class RecoveredIndex(LogIndex):
 
     def _readable(self, block: MessageBlock, found: messages.Messages) -> messages.Messages:
         """The messages of defined channels at possible times, by the channel ids of the whole file."""
-        recording = self.recordings.of(block)
-        mapped = map_channels(recording, self.recordings.unproven.get(block.offset, {}), found)
+        mapped = map_channels(self.recordings.of(block), self.recordings.unproven.get(block.offset, {}), found)
         if mapped is None:
             return found
         channels, keep = mapped
@@ -284,8 +283,7 @@ class RecoveredIndex(LogIndex):
             keys.append(last)
         if not self.losses.intact and any(a > b for a, b in pairwise(keys)):
             self.losses.add_harmless("the chunks are not in order of log time; they are put in order")
-            order = sorted(range(len(keys)), key=keys.__getitem__)
-            self.items = [self.items[i] for i in order]
+            self.items = [self.items[i] for i in sorted(range(len(keys)), key=keys.__getitem__)]
 
     def _set_header(self, scan: Scan) -> None:
         header = scan.header

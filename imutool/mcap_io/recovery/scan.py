@@ -256,8 +256,7 @@ class Scan(ScanResult):
 
     def _messages(self, position: int, length: int) -> int | None:
         """Adds messages outside chunks as one block; the last one only if its end is certain."""
-        limit = self.frames.limit
-        raw = self.source.at(position, min(max(RUN_BYTES, HEAD.size + length), limit - position))
+        raw = self.source.at(position, min(max(RUN_BYTES, HEAD.size + length), self.frames.limit - position))
         offsets, _, end = messages.scan(raw, bare=True)
         if not self.frames.ends_run(position + end, raw, offsets, self.used_channels):
             end = int(offsets[-1])

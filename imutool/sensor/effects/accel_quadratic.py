@@ -2,21 +2,6 @@
 
 from __future__ import annotations
 
-from imutool.sensor.effect import Effect, Stage, Theta, each_axis
-from imutool.sensor.samples import SensorSamples
+from imutool.sensor.effects.gyro_quadratic import quadratic
 
-
-def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
-    return samples.with_readings(accel=samples.accel * (1.0 + k * samples.accel))
-
-
-EFFECT = Effect(
-    "accel_quadratic",
-    Stage.SENSOR,
-    ("accel",),
-    "accel += k * f^2",
-    each_axis("s²/m", 6e-3),
-    "the attitude varies; it rectifies vibration",
-    _forward,
-    trained=True,
-)
+EFFECT = quadratic("accel", "f", "s²/m", 6e-3, "the attitude varies; it rectifies vibration")

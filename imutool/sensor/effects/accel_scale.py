@@ -2,21 +2,6 @@
 
 from __future__ import annotations
 
-from imutool.sensor.effect import Effect, Stage, Theta, each_axis
-from imutool.sensor.samples import SensorSamples
+from imutool.sensor.effects.gyro_scale import scale
 
-
-def _forward(samples: SensorSamples, s: Theta) -> SensorSamples:
-    return samples.with_readings(accel=samples.accel * (1.0 + s))
-
-
-EFFECT = Effect(
-    "accel_scale",
-    Stage.SENSOR,
-    ("accel",),
-    "accel += s * f",
-    each_axis("-", 0.05),
-    "the attitude varies; collinear with the bias otherwise",
-    _forward,
-    trained=True,
-)
+EFFECT = scale("accel", "f", 0.05, "the attitude varies; collinear with the bias otherwise")

@@ -31,8 +31,7 @@ def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     power = np.sum(slope**2, axis=1) + np.finfo(np.float64).tiny
     t_s, starts = samples.stamp_s, list[Theta]()
     for degree, count in ((0, STARTS), (1, ON_TREND)):
-        trend = np.vander((t_s - t_s[0]) / np.ptp(t_s), degree + 1)
-        step, gain = _steps(trend, common, power)
+        step, gain = _steps(np.vander((t_s - t_s[0]) / np.ptp(t_s), degree + 1), common, power)
         best = [int(part[np.argmax(gain[part])]) for part in np.array_split(np.arange(len(gain)), PARTS) if len(part)]
         best = sorted(best, key=lambda row: -gain[row])[:count]
         size = 0.0 if degree else 1.0  # a trend that is in the fit by now has changed the step

@@ -23,8 +23,7 @@ def warm_up(sensor: Sensor, unit: str, plausible: float) -> Effect:
     relaxation_of = Remembered(_relaxation)
 
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
-        added = np.outer(theta[:3], relaxation_of(samples.stamp_s, float(theta[3]))).T
-        return samples.with_added(sensor, added)
+        return samples.with_added(sensor, np.outer(theta[:3], relaxation_of(samples.stamp_s, float(theta[3]))).T)
 
     def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
         """Amplitudes by least squares, with a constant, for each tau."""

@@ -25,8 +25,7 @@ def hysteresis(sensor: Sensor, symbol: str, unit: str, plausible: float, observa
 
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
         ideal, share = getattr(samples, sensor), float(theta[1]) if len(theta) > 1 else 1.0
-        reading = ideal + share * (play(ideal, float(theta[0])) - ideal)
-        return samples.with_readings(gyro=reading) if sensor == "gyro" else samples.with_readings(accel=reading)
+        return samples.with_readings(**{sensor: ideal + share * (play(ideal, float(theta[0])) - ideal)})
 
     def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
         """The width by which the samples lag on the way up and on the way down."""

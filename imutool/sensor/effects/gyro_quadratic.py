@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from imutool.sensor.effect import Effect, Stage, Theta, each_axis
 from imutool.sensor.samples import SensorSamples
+from imutool.units import Sensor
 
 
-def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
-    return samples.with_readings(gyro=samples.gyro * (1.0 + k * samples.gyro))
+def quadratic(sensor: Sensor, symbol: str, unit: str, plausible: float, observable_if: str) -> Effect:
+    """Quadratic error of either sensor."""
+
+    def forward(samples: SensorSamples, k: Theta) -> SensorSamples:
+        return samples.with_gain(sensor, k * getattr(samples, sensor))
+
+    name, equation = f"{sensor}_quadratic", f"{sensor} += k * {symbol}^2"
+    return Effect(name, Stage.SENSOR, (sensor,), equation, each_axis(unit, plausible), observable_if, forward, trained=True)
 
 
-EFFECT = Effect(
-    "gyro_quadratic",
-    Stage.SENSOR,
-    ("gyro",),
-    "gyro += k * omega^2",
-    each_axis("s/rad", 0.1),
-    "it turns fast",
-    _forward,
-    trained=True,
-)
+EFFECT = quadratic("gyro", "omega", "s/rad", 0.1, "it turns fast")

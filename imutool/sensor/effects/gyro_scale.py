@@ -16,8 +16,14 @@ STEP = "step"  # variant of a scale that sets in at one time, also together with
 T_STEP = Parameter("t_step", "s", 30.0, begins=True)
 
 
-def _forward(samples: SensorSamples, s: Theta) -> SensorSamples:
-    return samples.with_readings(gyro=samples.gyro * (1.0 + s))
+def scale(sensor: Sensor, symbol: str, plausible: float, observable_if: str) -> Effect:
+    """Scale error of either sensor."""
+
+    def forward(samples: SensorSamples, s: Theta) -> SensorSamples:
+        return samples.with_gain(sensor, s)
+
+    name, equation = f"{sensor}_scale", f"{sensor} += s * {symbol}"
+    return Effect(name, Stage.SENSOR, (sensor,), equation, each_axis("-", plausible), observable_if, forward, trained=True)
 
 
 def of_form(effect: Effect, names: Container[str]) -> Effect:
@@ -62,13 +68,4 @@ def _from_one_time_on(whole: Effect) -> Effect:
 
 
 SCALES = ("gyro_scale", "accel_scale")
-EFFECT = Effect(
-    "gyro_scale",
-    Stage.SENSOR,
-    ("gyro",),
-    "gyro += s * omega",
-    each_axis("-", 0.1),
-    "the axis turns",
-    _forward,
-    trained=True,
-)
+EFFECT = scale("gyro", "omega", 0.1, "the axis turns")

@@ -7,7 +7,7 @@ from imutool.sensor.samples import SensorSamples
 
 
 def _forward(samples: SensorSamples, s: Theta) -> SensorSamples:
-    return samples.with_readings(gyro=samples.gyro * (1.0 + samples.stamp_s[:, None] * s))
+    return samples.with_gain("gyro", samples.stamp_s[:, None] * s)
 
 
 EFFECT = Effect(

@@ -8,7 +8,7 @@ from imutool.sensor.samples import SensorSamples
 
 
 def _forward(samples: SensorSamples, s: Theta) -> SensorSamples:
-    return samples.with_readings(gyro=samples.gyro * (1.0 + from_mean(samples)[:, None] * s))
+    return samples.with_gain("gyro", from_mean(samples)[:, None] * s)
 
 
 EFFECT = Effect(

@@ -266,8 +266,7 @@ def _general_fit(state: State, efforts: Columns) -> tuple[Float64[np.ndarray, "n
     columns, own = np.concatenate([common, np.stack(rates, axis=1)], axis=1), np.arange(2)
     kept = [np.concatenate([np.arange(common.shape[1]), common.shape[1] + 2 * k + own]) for k in range(n)]
     theta = _solved_each(columns, efforts, kept)
-    residual_std = np.array([(efforts[:, k] - columns[:, kept[k]] @ theta[k]).std() for k in range(n)])
-    return theta, residual_std
+    return theta, np.array([(efforts[:, k] - columns[:, kept[k]] @ theta[k]).std() for k in range(n)])
 
 
 def _by_joint(values: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> tuple[float, ...]:

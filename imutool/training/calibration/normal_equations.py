@@ -153,8 +153,7 @@ def _prefix(seen: Seen, pieces: Pieces, terms: Terms, true_u: Float[Tensor, "n 3
         by_all = torch.einsum("mkij,mkj->mi", A, true_u[index])
         return turns[:, -1], torch.cat([by_theta, A.sum(1), by_all[..., None]], dim=2)
 
-    chunks = enumerate(torch.split(pieces.index(), max(1, CHUNK // PIECE)))
-    turns, adds = zip(*of_each(added, chunks), strict=True)
+    turns, adds = zip(*of_each(added, enumerate(torch.split(pieces.index(), max(1, CHUNK // PIECE)))), strict=True)
     return Prefix.of(torch.cat(turns), torch.cat(adds))
 
 

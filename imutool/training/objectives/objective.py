@@ -113,8 +113,7 @@ class RestBiases(nn.Module):
 
 def orientation_error(model: BiasNetwork, windows: Windows) -> Float[Tensor, " batch"]:
     """|Log(R_hat^T R)| at the end of each window, in rad (paper, eq. 16, at the last sample)."""
-    R_hat = model.end_attitude(windows.R_start, windows.segment, windows.dt)
-    return length(so3.log(R_hat.mT @ windows.R_end))
+    return length(so3.log(model.end_attitude(windows.R_start, windows.segment, windows.dt).mT @ windows.R_end))
 
 
 def motion_error(model: BiasNetwork, windows: Windows) -> Float[Tensor, " batch"]:
@@ -204,8 +203,7 @@ class WindowEndObjective(Objective):
     """
 
     def _choose(self) -> None:
-        named = self.settings.window_s[self.sensor]
-        lengths = dict.fromkeys(self.pool.samples(window_s) for window_s in named)
+        lengths = dict.fromkeys(self.pool.samples(window_s) for window_s in self.settings.window_s[self.sensor])
         self.pools = [(n, first) for n in lengths if len(first := self.pool.starts(n, "train"))]
 
     def errors(self, first: Int[Tensor, " m"], n: int) -> Float[Tensor, " m"]:

@@ -135,8 +135,7 @@ def residual_against_rate(d: Diagnosis) -> str | None:
         rate: Line = trace.before[:, axis] if signal == "gyro" else np.linalg.norm(trace.before[:, :3], axis=1)
         return rate
 
-    names = {"gyro": "rate about {} (rad/s)", "accel": "turning rate (rad/s)"}
-    return _binned(d, variable, names, "rate")
+    return _binned(d, variable, {"gyro": "rate about {} (rad/s)", "accel": "turning rate (rad/s)"}, "rate")
 
 
 def residual_against_attitude(d: Diagnosis) -> str | None:

@@ -77,8 +77,7 @@ def rms_drift(stretches: Sequence[Stretch], side: int) -> tuple[Float64[np.ndarr
 
     `side` is 1 for before, 2 for after. As far as half of the stretches reach.
     """
-    lasting = float(np.median([stretch.truth.duration_s for stretch in stretches]))
-    t_s = np.arange(0.0, lasting + 1e-9, GRID_S)
+    t_s = np.arange(0.0, float(np.median([stretch.truth.duration_s for stretch in stretches])) + 1e-9, GRID_S)
     squares = np.full((len(stretches), len(t_s), 2), np.nan)
     for k, stretch in enumerate(stretches):
         own_s = (stretch.truth.t_ns - stretch.truth.t_ns[0]) * 1e-9

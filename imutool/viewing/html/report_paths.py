@@ -126,8 +126,7 @@ def _draw_heat(
     axes.plot(*_pieces(points, whole), color=HELD, lw=0.6)  # where the truth is unknown
     colors = [LEVELS[round(k * (len(LEVELS) - 1) / max(len(edges) - 2, 1))] for k in range(len(edges) - 1)]
     for k, color in enumerate(colors):
-        of_level = (level == k) & np.isfinite(error) & whole
-        x, y = _pieces(points, of_level)
+        x, y = _pieces(points, (level == k) & np.isfinite(error) & whole)
         axes.plot(x, y, color=color, lw=2.2, label=f"{edges[k]:g} to {edges[k + 1]:g} {unit}", solid_capstyle="round")
     _equal(axes, points[:, :2], MIN_EXTENT_M)
     axes.set(xlabel="x (m)", ylabel="y (m)")
@@ -146,8 +145,7 @@ def _pieces(points: Points, selected: Any) -> tuple[Any, Any]:
         return np.zeros(0), np.zeros(0)
     keep = np.unique(np.concatenate([starts, starts + 1]))
     out = points[keep].copy()
-    gaps = np.flatnonzero((np.diff(keep) > 1) | ~np.isin(keep[:-1], starts)) + 1
-    out = np.insert(out, gaps, np.nan, axis=0)
+    out = np.insert(out, np.flatnonzero((np.diff(keep) > 1) | ~np.isin(keep[:-1], starts)) + 1, np.nan, axis=0)
     return out[:, 0], out[:, 1]
 
 
@@ -156,8 +154,7 @@ def _broken(poses: Poses) -> Points:
     parts = split_at_gaps(poses)
     share = max(2, MAX_POINTS // max(len(parts), 1))
     hole = np.full((1, 3), np.nan)
-    rows = [piece for part in parts for piece in (part.p_wb[path_rows(part.p_wb, share)], hole)][:-1]
-    return np.concatenate(rows)
+    return np.concatenate([piece for part in parts for piece in (part.p_wb[path_rows(part.p_wb, share)], hole)][:-1])
 
 
 def _unit_of(extent_m: float) -> tuple[float, str]:

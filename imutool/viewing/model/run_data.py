@@ -181,8 +181,7 @@ def level_start(imu: Imu) -> StartPose:
 
     roll = atan2(f_y, f_z), pitch = atan2(-f_x, hypot(f_y, f_z)): exact if the IMU does not accelerate in that time.
     """
-    first = imu.between(int(imu.t_ns[0]), int(imu.t_ns[0]) + nanoseconds(LEVELLING_S))
-    f_x, f_y, f_z = first.accel.mean(axis=0)
+    f_x, f_y, f_z = imu.between(int(imu.t_ns[0]), int(imu.t_ns[0]) + nanoseconds(LEVELLING_S)).accel.mean(axis=0)
     level = Rotation.from_euler("ZYX", [0.0, np.arctan2(-f_x, np.hypot(f_y, f_z)), np.arctan2(f_y, f_z)])
     return StartPose(level.as_quat(scalar_first=True), np.zeros(3), np.zeros(3))
 

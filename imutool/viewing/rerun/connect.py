@@ -111,8 +111,7 @@ def full_url(url: str) -> str:
         raise ConfigError(f"{url!r} is no address ({error})", where="connect", expected=expected) from error
     if parts.scheme not in (PLAIN, *SECURE) or not parts.hostname or parts.path.rstrip("/") not in ("", PATH) or parts.query:
         raise ConfigError(f"{url!r} is no address", where="connect", expected=expected)
-    netloc = parts.netloc if port else f"{parts.netloc}:{DEFAULT_PORT}"
-    return parts._replace(netloc=netloc, path=PATH).geturl()
+    return parts._replace(netloc=parts.netloc if port else f"{parts.netloc}:{DEFAULT_PORT}", path=PATH).geturl()
 
 
 def _check_http2(url: str) -> None:

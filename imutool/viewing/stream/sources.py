@@ -158,8 +158,7 @@ def _lines(malformed: Malformed) -> Samples:
 
 def _udp(host: str, port: int, malformed: Malformed) -> Samples:
     """Samples from datagrams, each with one or several lines of JSON."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    line = socket.socket(family, socket.SOCK_DGRAM)
+    line = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
     try:
         line.bind((host, port))
     except OSError as error:

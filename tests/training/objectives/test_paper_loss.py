@@ -14,7 +14,7 @@ from imutool.bias.neural_ode import Config
 from imutool.errors import ConfigError, DataError
 from imutool.recording import Imu, Recording
 from imutool.training.objectives.objective import RestBiases
-from imutool.training.objectives.paper_loss import PaperLoss, biases_from_poses
+from imutool.training.objectives.paper_scheme import PaperLoss, biases_from_poses
 from imutool.training.settings import PaperSettings, TrainSettings
 from imutool.training.training_windows import Pool
 

@@ -71,8 +71,7 @@ def log_paths(data: RunData, to: rr.RecordingStream, scope: Scope, size: float) 
         role = sdk.role(trace)
         entity, color = sdk.trace_path(data, trace, scope, "world", role), color_of(data, trace)
         error = None if trace.is_raw or top is None or trace.errors is None else trace.errors.orientation_total_deg
-        colors = None if error is None or top is None else (error, top)
-        _log_path(to, data, entity, trace.path, colors, role, color)
+        _log_path(to, data, entity, trace.path, None if error is None or top is None else (error, top), role, color)
         _log_body(to, data, entity, trace.path, styles.body_style(role, sdk.label(data, trace), color, size))
         _log_worst(to, data, trace, entity, size)
         if not trace.is_raw and trace.errors is not None:

@@ -48,8 +48,7 @@ def comparison(logs: Sequence[RunData]) -> str:
         for k, trace in enumerate(data.traces):
             cells = [_cell(values[label][k]) if label in values else "" for label in labels]
             rows.append([escape(data.name), escape(trace.name), *cells])
-    heads = ["log", "run", *labels]
-    return "\n".join([f"# {len(logs)} logs", "", *table(heads, rows)])
+    return "\n".join([f"# {len(logs)} logs", "", *table(["log", "run", *labels], rows)])
 
 
 def _colors(data: RunData) -> list[str]:

@@ -151,8 +151,7 @@ def decade_frame(data: RunData, kind: str) -> DecadeFrame:
 
 def decimate_points(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "m 2"]:
     """Decimate a curve to the lowest and the highest point of each column of the drawing."""
-    bucket = np.floor(points[:, 0] / WIDTH * MAX_POINTS / 2.0)
-    edges = np.flatnonzero(np.diff(bucket, prepend=-1.0))
+    edges = np.flatnonzero(np.diff(np.floor(points[:, 0] / WIDTH * MAX_POINTS / 2.0), prepend=-1.0))
     rows = {0, len(points) - 1}
     for first, last in zip(edges, [*edges[1:], len(points)], strict=True):
         height = points[first:last, 1]
