@@ -143,6 +143,10 @@ class Layout:
     constants: tuple[tuple[int, bytes], ...]
     data: tuple[int, int] | None = None  # (first byte, bytes) of an image
 
+    def fits(self, message: bytes) -> bool:
+        """Whether a message has this layout."""
+        return len(message) >= self.size and all(message.startswith(value, at) for at, value in self.constants)
+
 
 class ByteWalk:
     """Position in a message that is read (or, without one, written), moving by one field.
