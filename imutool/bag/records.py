@@ -149,13 +149,11 @@ def head(data: bytes, at: int) -> Head | None:
     found = fields(data, at + 4, at + 4 + size)
     if found is None or len(op := found.get(b"op", b"")) != 1:
         return None
-    if (needed := NEEDED.get(op[0])) is None:
+    if (needed := NEEDED.get(op[0])) is None or (op[0] == Op.CHUNK and b"compression" not in found):
         return None
     for name, length in needed.items():  # a generator takes twice as long, of each message
         if len(found.get(name, b"")) != length:
             return None
-    if op[0] == Op.CHUNK and b"compression" not in found:
-        return None
     (length,) = U32.unpack_from(data, at + 4 + size)
     return Head(op[0], found, at, at + 8 + size, length)
 
