@@ -13,8 +13,6 @@ from io import BytesIO
 from struct import Struct
 from typing import Any, BinaryIO
 
-from imutool.recording.message_log import Message
-
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = 9  # bytes of a record ahead of its content: opcode and length
 RECORD, MESSAGE_HEAD = Struct("<BQ"), Struct("<HIQQ")  # a message: channel, sequence, log and publish times
@@ -149,18 +147,18 @@ def _crc(file: BinaryIO, end: int) -> int:
     return crc
 
 
-def in_order(reader: Any, file: BinaryIO, others: Counter[int]) -> Iterator[tuple[Any, Any, Message]]:
-    """Schema, channel and content of each message, in order of log time, then of the file.
+def in_order(summary: Any, file: BinaryIO, others: Counter[int]) -> Iterator[_Waiting]:
+    """Messages in order of log time, then of the file.
 
     Chunks are sorted as they come, in place of a heap of single messages. `others` counts records that are none of MCAP's own.
     """
     from mcap.data_stream import ReadDataStream
     from mcap.records import Chunk
 
-    summary, waiting = summary_of(reader, file), list[_Waiting]()
+    waiting = list[_Waiting]()
     for start_ns, at, size in sorted(Content(summary, file).blocks):
         due = bisect_left(waiting, (start_ns, at))
-        yield from (_defined(summary, record) for record in waiting[:due])
+        yield from waiting[:due]
         del waiting[:due]
         if size:
             file.seek(at)
@@ -170,7 +168,7 @@ def in_order(reader: Any, file: BinaryIO, others: Counter[int]) -> Iterator[tupl
             data = _unpacked(Chunk.read(ReadDataStream(file)))
         waiting += _messages_in(data, at, others)
         waiting.sort()
-    yield from (_defined(summary, record) for record in waiting)
+    yield from waiting
 
 
 def _unpacked(chunk: Any) -> bytes:
@@ -214,10 +212,3 @@ def _messages_in(data: bytes, at: int, others: Counter[int]) -> Iterator[_Waitin
         elif opcode > DATA_END:
             others[opcode] += 1
         place += length
-
-
-def _defined(summary: Any, waiting: _Waiting) -> tuple[Any, Any, Message]:
-    log_time, _, _, channel_id, publish_time, payload = waiting
-    channel = summary.channels[channel_id]
-    schema = summary.schemas[channel.schema_id] if channel.schema_id else None
-    return schema, channel, Message(channel, log_time, publish_time, payload)

@@ -269,12 +269,15 @@ def _messages(path: Path, images: bool, define: Define = as_defined, remarks: Re
     topics: dict[int, MessageTopic] = {}
     others = Counter[int]()
     with _refusing(path), path.open("rb") as file:
-        for schema, channel, message in in_order(_reader(file), file, others):
-            topic = topics.get(channel.id)
+        summary = summary_of(_reader(file), file)
+        for log_time, _, _, number, publish_time, payload in in_order(summary, file, others):
+            topic = topics.get(number)
             if topic is None:
-                topic = topics[channel.id] = define(_topic(schema, channel))
+                channel = summary.channels[number]
+                schema = summary.schemas[channel.schema_id] if channel.schema_id else None
+                topic = topics[number] = define(_topic(schema, channel))
             if images or not re.fullmatch(IMAGES, topic.schema_name):
-                yield message._replace(topic=topic, payload=_plain(topic, message.payload))
+                yield Message(topic, log_time, publish_time, _plain(topic, payload))
     loss = f"records in chunks that are none of MCAP's own are not carried over: {listed(others)}"
     if others and remarks is not None and loss not in remarks.losses:
         remarks.losses.append(loss)

@@ -261,8 +261,9 @@ class _ChunkScan:
                 if not self.loose:
                     self._lose(f"a record of kind {head.op} lies inside the chunk, at its byte {position}")
                 break  # the chunk ended ahead of it
-            following = records.head(self.data, head.end) if head is not None and head.end < end else None
-            if head is None or not (head.end == end or following is not None or self._cut(head.end)):
+            after = position if head is None else head.end
+            following = records.head(self.data, after) if position < after < end else None
+            if head is None or not (after == end or following is not None or self._cut(after)):
                 head = self._resume(position, end)
                 position = end if head is None else head.at
                 continue
@@ -270,10 +271,10 @@ class _ChunkScan:
             if head.op == Op.CONNECTION:
                 self._define(head)
             elif number in bag.connections and number not in bag.doubtful:
-                found.append(Message(number, head.time_ns, head.at, head.data_at, head.end))
+                found.append(Message(number, head.time_ns, head.at, head.data_at, after))
             else:
                 unknown[number] += 1
-            position, head = head.end, following
+            position, head = after, following
         for number, count in unknown.items():
             self._lose(f"{count} messages are of connection {number}, which nothing defines for sure")
         return found

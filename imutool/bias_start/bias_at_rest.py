@@ -15,7 +15,7 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import BiasModel, Vector6
-from imutool.bias_start.bias_tracking import FilteredBlock, Samples, filter_blocks
+from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_blocks, filter_together
 from imutool.bias_start.initial_bias import (
     AT_REST_STD,
     TRACKED_BY,
@@ -130,11 +130,8 @@ def at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     if bounds is None:
         raise _no_rest()
     start, samples = prior(model, int(imu.t_ns[0])), imu.rows(slice(*bounds))
-    residual = (
-        np.concatenate([samples.gyro, samples.accel], axis=1)
-        - model.stream(start.rest)(*relative_samples(samples))
-        + start.rest
-    )
+    u = np.concatenate([samples.gyro, samples.accel], axis=1)
+    residual = u - model.stream(start.rest)(*relative_samples(samples)) + start.rest
     mean = residual.mean(axis=0)
     squares = ((residual - mean) ** 2).sum(axis=0)
     stretch = _RestStretch(mean, squares, len(samples), int(samples.t_ns[0]), int(samples.t_ns[-1]))
@@ -213,7 +210,9 @@ def refuted_stops(samples: Samples, model: BiasModel) -> tuple[Vector6, Vector6]
     """
     own = bias_prior(model)
     known = replace(UNTRAINED, mean=own.mean, std=UNKNOWN_STD, settings=own.settings)
-    runs = zip(*(filter_blocks(model, [samples], each) for each in (known, replace(known, stops=False))), strict=True)
+    bias, (t_s, gyro, accel) = model.stream(own.mean)(*samples) - own.mean, samples
+    filters = [BiasFilter(each, ahead=True) for each in (known, replace(known, stops=False))]
+    runs = zip(*filter_together(filters, [(t_s, gyro - bias[:, :3], accel - bias[:, 3:])] * 2), strict=True)
     later = list(itertools.dropwhile(lambda blocks: not blocks[0].resting, runs))
     moving = list(zip(*(blocks for blocks in later if not blocks[0].resting), strict=True))
     if not moving:

@@ -190,7 +190,7 @@ def filter_together(filters: Sequence[BiasFilter], samples: Sequence[Samples]) -
         if True in rest or len(states) < len(filters) or first.longest_s > GAP_S:
             found = [each._pass(*block) for each, block in zip(filters, blocks, strict=True)]
         else:
-            x = State(*map(np.array, zip(*(vars(state).values() for state in states), strict=True)))
+            x = State(*map(np.array, zip(*states, strict=True)))
             together = first._replace(u=np.stack([block.u for block, _ in blocks], axis=1))
             step = _step(x, together, False, filters[0]._walk, filters[0].settings)
             found = [FilteredBlock(first.t_s[0].item(), first.t_s[-1].item(), False, step.of(k)) for k in range(len(filters))]

@@ -7,6 +7,7 @@ the judged poses' frame turn with it. The record `imutool_corrections` says what
 from __future__ import annotations
 
 import heapq
+import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -125,7 +126,7 @@ class Corrections:
             if (reflected := self.reflected.get(name)) is not None:
                 raw = reflected.with_stamp(raw, stamp_ns)
             else:
-                patch = _MessagePatch(message.topic, raw)
+                patch = self._patch(message.topic, raw)
                 patch.move_stamp(stamp_ns - patch.stamp_ns())
                 raw = bytes(patch.data)
             yield self._corrected(message._replace(payload=raw))
@@ -138,10 +139,10 @@ class Corrections:
             patched = self.reflected[topic.name].with_vectors(bytes(message.payload), self.imus[topic.name])
             return message._replace(payload=patched)
         if topic.name in self.imus:
-            return message._replace(payload=_corrected_imu(topic, bytes(message.payload), *self.imus[topic.name]))
+            return message._replace(payload=_corrected_imu(self._patch(topic, message.payload), *self.imus[topic.name]))
         if not (self.pose_topic and _is_pose(topic)):
             return message
-        patch = _MessagePatch(topic, bytes(message.payload))
+        patch = self._patch(topic, message.payload)
         before_ns = patch.stamp_ns()
         self._correct_poses(topic, patch)
         moved_ns = patch.stamp_ns() - before_ns
@@ -149,6 +150,17 @@ class Corrections:
             published = message.publish_time + moved_ns if 0 < message.publish_time < LATEST_NS else message.publish_time
             message = message._replace(log_time=message.log_time + moved_ns, publish_time=max(published, 0))
         return message._replace(payload=bytes(patch.data))
+
+    @cached_property
+    def _layouts(self) -> dict[MessageTopic, schemas.Layout]:
+        """Layout of each topic's last message, which nearly every next one shares."""
+        return {}
+
+    def _patch(self, topic: MessageTopic, payload: bytes | memoryview) -> _MessagePatch:
+        schema_name, raw, layout = schemas.canonical(topic.schema_name), bytes(payload), self._layouts.get(topic)
+        if layout is None or not layout.fits(raw):
+            layout = self._layouts[topic] = schemas.layout_of(schema_name, topic.message_encoding, message=raw)
+        return _MessagePatch(schema_name, layout, raw)
 
     @cached_property
     def _turns(self) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, "4 4"]]:
@@ -183,10 +195,9 @@ class Corrections:
 class _MessagePatch:
     """Payload whose numbers and stamps are written in place."""
 
-    def __init__(self, topic: MessageTopic, payload: bytes) -> None:
-        self.schema_name = schemas.canonical(topic.schema_name)
-        self.layout = schemas.layout_of(self.schema_name, topic.message_encoding, message=payload)
-        self.data = bytearray(payload)
+    def __init__(self, schema_name: str, layout: schemas.Layout, payload: bytes) -> None:
+        self.schema_name, self.layout, self.data = schema_name, layout, bytearray(payload)
+        self._stamp = struct.Struct(f"{layout.order}{'i' if layout.seconds == 'i4' else 'I'}I")
 
     def numbers(self, which: int = 0) -> np.ndarray:
         """Numbers of one element: a view."""
@@ -195,27 +206,20 @@ class _MessagePatch:
 
     def stamp_ns(self, which: int = 0) -> int:
         """Stamp of one element."""
-        at, order = self.layout.stamps[which], self.layout.order
-        seconds = np.frombuffer(self.data, f"{order}{self.layout.seconds}", 1, at)
-        return int(seconds[0]) * schemas.NS_PER_S + int(np.frombuffer(self.data, f"{order}u4", 1, at + 4)[0])
+        seconds, nanos = self._stamp.unpack_from(self.data, self.layout.stamps[which])
+        return int(seconds) * schemas.NS_PER_S + int(nanos)
 
     def move_stamp(self, by_ns: int, which: int = 0) -> None:
         """Shift a stamp."""
-        at, order = self.layout.stamps[which], self.layout.order
-        seconds = np.frombuffer(self.data, f"{order}{self.layout.seconds}", 1, at)
-        nanos = np.frombuffer(self.data, f"{order}u4", 1, at + 4)
         moved_ns = self.stamp_ns(which) + by_ns
         if moved_ns < 0 and self.layout.seconds == "u4":
             what = f"a stamp of {moved_ns - by_ns} ns, moved by {by_ns} ns, lies before 0"
             raise DataError(what, expected="stamps that ROS 1 can store", fix="Cut the log there, or convert it to ROS 2 first")
-        seconds[0], nanos[0] = divmod(moved_ns, schemas.NS_PER_S)
+        self._stamp.pack_into(self.data, self.layout.stamps[which], *divmod(moved_ns, schemas.NS_PER_S))
 
 
-def _corrected_imu(
-    topic: MessageTopic, payload: bytes, gyro: Float64[np.ndarray, "3 3"], accel: Float64[np.ndarray, "3 3"]
-) -> bytes:
+def _corrected_imu(patch: _MessagePatch, gyro: Float64[np.ndarray, "3 3"], accel: Float64[np.ndarray, "3 3"]) -> bytes:
     """Message of an IMU in right units and axes: both vectors, covariances, own orientation."""
-    patch = _MessagePatch(topic, payload)
     numbers = patch.numbers()
     for matrix, vector, covariance in (
         (gyro, schemas.GYRO, schemas.GYRO_COVARIANCE),

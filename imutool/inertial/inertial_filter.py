@@ -28,7 +28,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -75,8 +74,7 @@ class FilterSettings(Settings, frozen=True, kw_only=True):
     start_m_s2: Positive = 1.5  # mean acceleration over the first block: its tilt of "up"
 
 
-@dataclass(frozen=True)
-class State:
+class State(NamedTuple):
     """Filter state: pose, biases, steady motion, covariance and offsets of other sensors.
 
     Biases are gyro (rad/s), then accel (m/s²): b in motion, and the offset d at rest. The steady motion is the pivot's place r
@@ -90,7 +88,7 @@ class State:
     ground: Vector6
     steady: Vector6
     P: Covariance
-    offsets: Float64[np.ndarray, "*filters _"] = field(default_factory=lambda: np.zeros(0))  # of other sensors
+    offsets: Float64[np.ndarray, "*filters _"] = np.zeros(0)  # of other sensors
 
     def rest_bias(self, resting: bool) -> Vector6:
         """Bias of the sensor, at rest or in motion."""
@@ -130,7 +128,7 @@ class Step(NamedTuple):
 
     def of(self, k: int) -> Step:
         """Step of one filter of several."""
-        before, expected, after = (State(*(x[k] for x in vars(s).values())) for s in (self.before, self.expected, self.after))
+        before, expected, after = (State(*(x[k] for x in s)) for s in (self.before, self.expected, self.after))
         return Step(before, expected, self.F[k], after, self.innovation and tuple(x[k] for x in self.innovation))
 
 
@@ -279,7 +277,7 @@ def pause_step(x: State, T: float, walk: Walk) -> Step:
     """Step over a gap of T seconds in the samples: the state stays, less certain of its pose."""
     std = np.repeat([PAUSE_RAD, PAUSE_M_S, min(PAUSE_M_S * T, PAUSE_M)], 3)
     noise = np.concatenate([std**2, walk[:6] ** 2 * T, np.zeros(12), walk[6:] ** 2 * T]) + MIN_VARIANCE
-    expected = replace(x, P=x.P + np.diag(noise))
+    expected = x._replace(P=x.P + np.diag(noise))
     return Step(x, expected, np.eye(len(x.P)), expected)
 
 
@@ -294,5 +292,5 @@ def reset_pose(x: State, accel: Vector3, T: float, walk: Vector6, maximum: Vecto
     P[grown, grown] += np.minimum(walk**2 * T, np.maximum(maximum - P[grown, grown], 0.0))
     F = np.zeros((SIZE, SIZE))
     F[9:, 9:] = np.eye(SIZE - 9)
-    fresh = replace(fresh, P=P)
+    fresh = fresh._replace(P=P)
     return Step(x, fresh, F, fresh)

@@ -31,11 +31,8 @@ MAX_OFF, MAX_UNCERTAIN = 0.005, 0.003  # share by which the grid's true step dif
 MIN_NEXT = 0.1  # share of neighbours that are one step apart: else the true step is larger
 ROUNDED = 1e-5  # of a step: rounding moves a value by less
 MAX_COUNTS = 2.0**16  # of a register
-MIN_WHOLE, WHOLE_OFF, WHOLE_ROWS = (
-    200,
-    0.1,
-    10_000,
-)  # different counts of all values, what each may be off, rows that are taken
+MIN_WHOLE, WHOLE_OFF, WHOLE_ROWS = 200, 0.1, 10_000  # different counts of all values, what each may be off, rows that are taken
+FIRST = 500  # values that are looked at before all others
 
 
 def unit_by_steps(rates: Float64[np.ndarray, "n 3"]) -> tuple[str, float] | None:
@@ -44,18 +41,23 @@ def unit_by_steps(rates: Float64[np.ndarray, "n 3"]) -> tuple[str, float] | None
     ordered = [np.sort(axis[np.isfinite(axis)]) for axis in rates.T]
     likely = _likely(ordered, np.array([step for _, step in STEPS]))
     found = [(unit, step) for (unit, step), worth in zip(STEPS, likely, strict=True) if worth and _counts_in(ordered, step)]
-    found = found or [(unit, step) for unit, step in STEPS if _are_whole(rates[:: max(1, len(rates) // WHOLE_ROWS)], step)]
+    some = rates[:: max(1, len(rates) // WHOLE_ROWS)]
+    some = some[np.isfinite(some)]
+    found = found or [(unit, step) for unit, step in STEPS if _are_whole(some, step)]
     return found[0] if len({unit for unit, _ in found}) == 1 else None
 
 
-def _are_whole(rates: Float64[np.ndarray, "n 3"], step: float) -> bool:
+def _are_whole(values: Float64[np.ndarray, " n"], step: float) -> bool:
     """Whether all values are whole numbers of a step and of no multiple, as of a motion with few values near the median."""
-    counts = rates[np.isfinite(rates)] / step
-    whole = np.sort(counts.round())  # np.unique imports numpy.ma
+    for some in (values[:FIRST], values):  # the first refute nearly every step
+        counts = some / step
+        whole = counts.round()
+        if np.abs(counts - whole).max(initial=0.0) > WHOLE_OFF:
+            return False
+    whole.sort()  # np.unique imports numpy.ma
     whole = whole[np.diff(whole, prepend=-np.inf) > 0.0]
-    if len(whole) < MIN_WHOLE or np.abs(counts - counts.round()).max() > WHOLE_OFF:
-        return False
-    return bool(np.abs(whole).max() < MAX_COUNTS and np.gcd.reduce(whole.astype(np.int64)) == 1)
+    enough = len(whole) >= MIN_WHOLE and np.abs(whole).max() < MAX_COUNTS
+    return bool(enough and np.gcd.reduce(whole.astype(np.int64)) == 1)
 
 
 def _likely(ordered: Sequence[Float64[np.ndarray, " _"]], steps: Float64[np.ndarray, " m"]) -> Iterator[bool]:

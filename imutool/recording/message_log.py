@@ -39,6 +39,9 @@ class MessageTopic:
     message_encoding: str
     metadata: tuple[tuple[str, str], ...] = ()
 
+    def __hash__(self) -> int:  # of every message, whose topic is looked up
+        return hash(self.name)
+
 
 class Message(NamedTuple):
     """Encoded message of a topic with its log and publish times (ns)."""

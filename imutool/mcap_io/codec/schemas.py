@@ -99,6 +99,7 @@ def ros1_definition(schema_name: str) -> str:
     return separator.join(part for part in known if not part.startswith("builtin_interfaces/Time"))
 
 
+@cache
 def canonical(schema_name: str) -> str:
     """ROS 2 spelling of a schema's name: `sensor_msgs/msg/Imu` for `sensor_msgs/Imu`."""
     package, slash, name = schema_name.partition("/")
@@ -141,6 +142,10 @@ class Layout:
     texts: tuple[str, ...]
     constants: tuple[tuple[int, bytes], ...]
     data: tuple[int, int] | None = None  # (first byte, bytes) of an image
+
+    def fits(self, message: bytes) -> bool:
+        """Whether a message has this layout."""
+        return len(message) >= self.size and all(message.startswith(value, at) for at, value in self.constants)
 
 
 class ByteWalk:
