@@ -34,6 +34,7 @@ from imutool.mcap_io.topics import (
     reflected_topics,
     topics_of,
 )
+from imutool.recording.message_log import COMMAND
 
 logger = logging.getLogger(__name__)
 
@@ -124,15 +125,14 @@ class Log:
 
     @property
     def pose_topics(self) -> list[str]:
-        """Topics with poses; /tf only where no other topic has poses, and never /tf_static."""
-        dedicated = [t.name for t in self.with_schema(MESSAGE_POSES)]
+        """Topics with poses of a body; /tf only where no other topic has poses, and never /tf_static."""
+        dedicated = [t.name for t in self.with_schema(MESSAGE_POSES) if t.pose_kind != COMMAND]
         return dedicated or [t.name for t in self.with_schema((schemas.TF,)) if not t.name.endswith("tf_static")]
 
     @property
     def truth_topics(self) -> list[str]:
         """Pose topics that may serve as truth: true ones first, then those of unknown kind; no estimate and no odometry."""
-        kinds = {name: self.topics[name].pose_kind for name in self.pose_topics}
-        return [name for wanted in ("truth", "unknown") for name, kind in kinds.items() if kind == wanted]
+        return [n for kind in ("truth", "unknown") for n in self.pose_topics if self.topics[n].pose_kind == kind]
 
     def with_schema(self, schema_names: Collection[str]) -> list[Topic]:
         """Topics with one of these message types, in order of their channel ids."""

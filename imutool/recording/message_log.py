@@ -18,9 +18,12 @@ from imutool.recording import Imu, Poses, Scalars, Times
 
 KINDS = ("truth", "estimate", "odometry", "unknown")  # what poses are worth
 
+COMMAND = "command"  # where a robot shall go: poses that are of no body
 KIND_WORDS = {  # in the names of topics
     "truth": "ground_truth|groundtruth|gt|truth|mocap|vicon|vrpn|optitrack|qualisys|natnet",
-    "estimate": "filtered|fused|estimate|estimated|ekf|ukf|kalman|slam|vio|vins|msckf|okvis|orb|lio|amcl|local_position|vision",
+    COMMAND: "set_?points?|goals?|way_?points?|desired|planned|cmd|command(s|ed)?|target_pose",
+    "estimate": r"filter(ed)?|fused|fusion|estimat(e|ed|or|ion)|ekf|ukf|kalman|slam\d?|vio|vins|msckf|okvis|orb|lio|amcl|ndt|rovio|svo|"
+    "localization|tracked_pose|local_position|vision|zed_node",
     "odometry": "odom|odometry|wheel|wheels|encoder|encoders",
 }
 
@@ -86,7 +89,7 @@ class Remarks:
 
 
 def named_kind(topic: str, schema_name: str) -> str:
-    """What poses are worth by the words of their topic's name, then by their type."""
+    """What poses are worth by the words of their topic's name, then by their type; `COMMAND` of those of no body."""
     words = "_".join(filter(None, re.split(r"[^a-z0-9]+", topic.lower())))
     for kind, pattern in KIND_WORDS.items():
         if re.search(rf"(^|_)({pattern})(_|$)", words):

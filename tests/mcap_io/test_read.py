@@ -111,6 +111,11 @@ def test_truth_comes_from_any_pose_message(foreign: Foreign, make: Make, kind: s
     assert truth.v_w is None
 
 
+def test_goals_are_poses_of_no_body(foreign: Foreign, make: Make) -> None:
+    recording = read(foreign(imu_messages(make) + poses(make, "/odom", schemas.ODOMETRY) + poses(make, "/goal_pose")))
+    assert (dict(recording.truths), dict(recording.other_poses)) == ({}, {"/odom": "odometry"})
+
+
 def tree(make: Make, children: list[str], count: int = 4) -> list[Message]:
     q = np.array([1.0, 0, 0, 0])
     return [
