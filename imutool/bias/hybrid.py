@@ -9,6 +9,7 @@ held-out part: then debiasing is a few products a sample.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from functools import partial
@@ -89,6 +90,12 @@ class Model(BiasModel):
         """Model for samples at another rate."""
         out = super().at(rate_hz)
         out.ode = None if self.ode is None else self.ode.at(rate_hz)
+        return out
+
+    def of_sensor(self) -> Self:
+        """Model without the lever arm to the point of the poses' positions, which is no error of the sensor."""
+        out, arms = copy.copy(self), [p for form in self.effects["accel"] for p in [form.name == "lever_arm"] * len(form.parameters)]
+        out.tensors = {**self.tensors, "theta_accel": np.where(arms, 0.0, self.tensors["theta_accel"])}
         return out
 
     def error(self, sensor: Sensor, signals: Signals) -> Float64[np.ndarray, "n 3"]:

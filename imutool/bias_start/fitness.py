@@ -175,9 +175,9 @@ def _wrong_gravity(samples: Samples, start: InitialBias) -> str:
 
 
 def _without_motion(model: BiasModel, samples: Samples, prior: BiasPrior) -> Samples:
-    """Samples minus the model's motion-dependent bias."""
+    """Samples minus the sensor's motion-dependent bias."""
     t_s, gyro, accel = samples
-    bias = model.stream(prior.mean)(t_s, gyro, accel) - prior.mean
+    bias = model.of_sensor().stream(prior.mean)(t_s, gyro, accel) - prior.mean
     return t_s, gyro - bias[:, :3], accel - bias[:, 3:]
 
 
