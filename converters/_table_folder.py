@@ -249,7 +249,7 @@ def _clocks(folder: Path) -> dict[str, tuple[np.ndarray, str]]:
 
 
 def _count_rows(whole: Columns) -> None:
-    """Add the time since the first row of poses that state only their rate; with as many rows as another table they have its."""
+    """Add the time of poses that state only their rate; with as many rows as another table they have its times."""
     for group in (TRUTH_GROUP, POSES_GROUP):
         own = [column for column in whole.values if column.startswith(f"{group}/")]
         lengths = {len(values) for column, values in whole.values.items() if column not in own}

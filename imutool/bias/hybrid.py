@@ -92,12 +92,6 @@ class Model(BiasModel):
         out.ode = None if self.ode is None else self.ode.at(rate_hz)
         return out
 
-    def of_sensor(self) -> Self:
-        """Model without the lever arm to the point of the poses' positions, which is no error of the sensor."""
-        out, arms = copy.copy(self), [p for form in self.effects["accel"] for p in [form.name == "lever_arm"] * len(form.parameters)]
-        out.tensors = {**self.tensors, "theta_accel": np.where(arms, 0.0, self.tensors["theta_accel"])}
-        return out
-
     def error(self, sensor: Sensor, signals: Signals) -> Float64[np.ndarray, "n 3"]:
         """Error of the effects at some signals (rad/s or m/s²)."""
         return self._compiled(sensor)(signals)
@@ -144,6 +138,15 @@ class Model(BiasModel):
         """Effects that follow from the samples, and where their parameters stand."""
         effects = self.effects[sensor]
         return samples_alone(effects), columns_of(effects, temperature=False)
+
+
+def without_lever_arm(model: BiasModel) -> BiasModel:
+    """Model without its lever arm to the poses' point, which is no error of the sensor."""
+    if not isinstance(model, Model):
+        return model
+    out, arms = copy.copy(model), [form.name == "lever_arm" for form in model.effects["accel"] for _ in form.parameters]
+    out.tensors = {**model.tensors, "theta_accel": np.where(arms, 0.0, model.tensors["theta_accel"])}
+    return out
 
 
 def _roots_at(

@@ -146,10 +146,6 @@ class BiasModel(ABC):
         (out := copy.copy(self)).rate_hz = rate_hz
         return out
 
-    def of_sensor(self) -> Self:
-        """Model of the errors of the sensor alone."""
-        return self
-
     @classmethod
     def shapes(cls, config: Settings) -> Shapes:
         """Shapes of the tensors by name; they need no memory, whatever sizes the settings give.

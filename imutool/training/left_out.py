@@ -222,7 +222,7 @@ def _log_errors(
     return out
 
 
-def beaten(errors: Float64[np.ndarray, "logs *starts"], others: Float64[np.ndarray, "logs *starts"], surely: float = 1.0) -> bool:
+def beaten(errors: Float64[np.ndarray, "logs ..."], others: Float64[np.ndarray, "logs ..."], surely: float = 1.0) -> bool:
     """Whether errors are smaller by `MIN_GAIN` and by `surely` standard errors over the logs.
 
     The gain of a log is the mean over the starts that both have: errors without truth are larger than those from the truth. A
