@@ -28,13 +28,13 @@ from ._table_header import MOSTLY
 from ._table_look import look, recorded_apart
 from ._table_map import POSES_GROUP, TRUTH_GROUP
 from ._table_merged import join_positions
-from ._table_names import TIME_WORDS, is_named_time, name_and_unit, split_name
+from ._table_names import TIME_WORDS, is_named_time, leaf_of, name_and_unit, split_name
 from ._table_numpy import npy_shape, read_npy
 from ._table_packed import read_bytes, table_name
 from ._table_roles import POSES, Names, role_folders, role_groups, shared_names, without_role
 from ._table_sensors import SENSORS, SPACED, name_columns, sensors_among
 from ._table_text import LOOKED_AT, Columns, is_text_table, read_csv, text_of
-from ._table_times import rises
+from ._table_times import rises, stated_rate
 from .px4_csv import logs_in
 from .sensor_tables import is_phone
 
@@ -137,6 +137,7 @@ def load_split(folder: Path, recording: str) -> Columns:
         if group == TRUTH_GROUP:
             add_local(part)
         whole.take(group, part, path.name)
+    _count_rows(whole)
     join_positions(whole)
     return whole
 
@@ -243,12 +244,22 @@ def _clocks(folder: Path) -> dict[str, tuple[np.ndarray, str]]:
     return found
 
 
+def _count_rows(whole: Columns) -> None:
+    """Add the time of poses that state only their rate; with as many rows as another table they have its times."""
+    for group in (TRUTH_GROUP, POSES_GROUP):
+        own = [column for column in whole.values if column.startswith(f"{group}/")]
+        lengths = {len(values) for column, values in whole.values.items() if column not in own}
+        rate = stated_rate(whole, own[0]) if own and not any(is_named_time(leaf_of(column)) for column in own) else None
+        if rate and (count := len(whole.values[own[0]])) not in lengths:
+            whole.values[f"{group}/time"], whole.units[f"{group}/time"] = np.arange(count) / rate[1], "s"
+            whole.remarks.notes.append(f"the poses have no time: rows are counted, at the {rate[0]!r} of {rate[1]:.6g} Hz")
+
+
 def _give_time(part: Columns, path: Path, clocks: dict[str, tuple[np.ndarray, str]]) -> None:
     """Add the time of the clock with as many rows to a table without one; of several that whose name its own begins with."""
-    has_time = any(map(is_named_time, part.values))
     length = len(next(iter(part.values.values()), ()))
     fits = [name for name, (values, _) in clocks.items() if len(values) == length]
-    if has_time or not fits:
+    if any(map(is_named_time, part.values)) or not fits:
         return
     values, unit = clocks[max(fits, key=lambda name: len(name) if _stem(path).lower().startswith(name) else -1)]
     part.values = {"time": values, **part.values}

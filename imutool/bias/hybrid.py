@@ -9,6 +9,7 @@ held-out part: then debiasing is a few products a sample.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from functools import partial
@@ -137,6 +138,15 @@ class Model(BiasModel):
         """Effects that follow from the samples, and where their parameters stand."""
         effects = self.effects[sensor]
         return samples_alone(effects), columns_of(effects, temperature=False)
+
+
+def without_lever_arm(model: BiasModel) -> BiasModel:
+    """Model without its lever arm to the poses' point, which is no error of the sensor."""
+    if not isinstance(model, Model):
+        return model
+    out, arms = copy.copy(model), [form.name == "lever_arm" for form in model.effects["accel"] for _ in form.parameters]
+    out.tensors = {**model.tensors, "theta_accel": np.where(arms, 0.0, model.tensors["theta_accel"])}
+    return out
 
 
 def _roots_at(

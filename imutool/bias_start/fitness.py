@@ -5,7 +5,7 @@ which ties the gyro to gravity. Under a model that fits, the innovations e of th
 chi-square with three degrees of freedom (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
 Navigation, 2001, sec. 5.4), and the bias that the log shows lies within the prior of the training runs. The innovations of the
 raw samples ask for the whole of the model's correction in motion (`imutool.inertial.innovations`), whatever bias a new
-switching-on gave; a log that asks for less than half is another unit's.
+switching-on gave; a log that asks for less than half is another unit's. A lever arm is no such correction.
 Where one of the three fails, the likelihood of the innovations is compared with that of the raw samples and an unknown constant
 bias: the model is unfit if even from its start in this log it explains the samples worse than no model, if the log asks for the
 opposite of its correction, or if its bias and its correction are both another unit's.
@@ -24,6 +24,7 @@ import msgspec
 import numpy as np
 
 from imutool.bias import static
+from imutool.bias.hybrid import without_lever_arm
 from imutool.bias.log_binding import other_conditions
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias.model_file import library, shipped_for
@@ -106,8 +107,9 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
 def _trained(model: BiasModel, start: InitialBias, samples: Samples, about: Mapping[str, str], prior: BiasPrior) -> Fitness:
     """Fitness of a trained model."""
     unknown = replace(prior, mean=np.where(np.abs(prior.mean) > UNKNOWN_STD, prior.mean, 0.0), std=UNKNOWN_STD, minimum=None)
-    corrected = _without_motion(model, samples, prior)
-    found, none, unstarted = _evidence((corrected, samples, corrected), (prior, unknown, unknown))
+    corrected, of_sensor = (_without_motion(each, samples, prior) for each in (model, without_lever_arm(model)))
+    at_poses = (*samples[:2], samples[2] + corrected[2] - of_sensor[2])  # a lever arm is no error of the sensor
+    found, none, unstarted = _evidence((corrected, at_poses, corrected), (prior, unknown, unknown))
     shown_std = np.sqrt(DEPENDENT**2 * found.variance + AT_REST_STD**2)
     other_start, harmful = contradicted_start(start.rest, start.std, prior.mean + found.difference, shown_std)
     supported = supported_std(prior.std, prior.minimum, found.difference, DEPENDENT**2 * found.variance)

@@ -102,7 +102,8 @@ def left_out_table(left_out: Mapping[str, Any]) -> None:
         for log in logs
     ]
     for error in dict.fromkeys(error for _, error, _ in rows):
-        columns = zip(*(values for _, of, values in rows if of == error), strict=True)
+        known = (values for _, of, values in rows if of == error and {*values} != {None})  # too short a log has no drift
+        columns = zip(*known, strict=True)
         rows.append(("mean", error, [None if None in column else sum(column) / len(column) for column in columns]))
     cells = [
         (

@@ -209,23 +209,28 @@ def keep(scores: Sequence[Score], sensor: Sensor) -> str:
     )
 
 
-def _log_errors(scores: Sequence[Score], logs: Sequence[str], model: str, criterion: Criterion) -> Float64[np.ndarray, " logs"]:
-    """Logarithm of an error of each log, or its mean over all starts; NaN where there is none."""
-    out = []
-    for log in logs:
-        some = [score for score in scores if (score.model, score.log) == (model, log) and criterion.start in ("", score.start)]
-        known = [max(value, MIN_ERROR) for score in some if (value := getattr(score, criterion.field)) is not None]
-        out.append(float(np.mean(np.log(known))) if known else np.nan)
-    return np.array(out)
+def _log_errors(
+    scores: Sequence[Score], logs: Sequence[str], model: str, criterion: Criterion
+) -> Float64[np.ndarray, "logs starts"]:
+    """Logarithm of an error of each log with each start, those of raw samples with all; NaN where there is none."""
+    out = np.full((len(logs), len(STARTS)), np.nan)
+    for score in scores:
+        value = getattr(score, criterion.field)
+        if score.model == model and criterion.start in ("", score.start) and value is not None:
+            starts = slice(None) if not score.start else STARTS.index(score.start)
+            out[logs.index(score.log), starts] = np.log(max(value, MIN_ERROR))
+    return out
 
 
-def beaten(errors: Float64[np.ndarray, " logs"], others: Float64[np.ndarray, " logs"], surely: float = 1.0) -> bool:
+def beaten(errors: Float64[np.ndarray, "logs ..."], others: Float64[np.ndarray, "logs ..."], surely: float = 1.0) -> bool:
     """Whether errors are smaller by `MIN_GAIN` and by `surely` standard errors over the logs.
 
-    A true gain scatters from log to log, too, if only some motions show it. So a gain also counts that is beyond chance without
+    The gain of a log is the mean over the starts that both have: errors without truth are larger than those from the truth. A
+    true gain scatters from log to log, too, if only some motions show it. So a gain also counts that is beyond chance without
     the log that gains most. Chance loses as often as it gains, so the losses show its variance.
     """
-    gain = np.sort((errors - others)[np.isfinite(errors - others)])
+    gains = np.reshape(errors - others, (len(errors), -1))
+    gain = np.sort(np.nanmean(gains[np.isfinite(gains).any(axis=1)], axis=1))
     if not len(gain):
         return False
     scatter = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0

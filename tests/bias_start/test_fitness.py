@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import imutool
-from imutool.bias import linear, static
+from imutool.bias import hybrid, linear, static
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import save
 from imutool.bias_start import Fitness, fitness
@@ -59,6 +59,18 @@ def test_the_sensor_itself_fits(model: BiasModel, recording: Recording) -> None:
     given = judge(static.Model(), from_numbers("0,0,0,0,0,0"), [], {})
     assert given.verdict == "fits"
     assert "at rest" not in given.reasons[0]
+
+
+@pytest.mark.parametrize("arm_m", [-1.0, 1.0])
+def test_an_arm_to_the_point_of_the_poses_is_no_correction_of_the_sensor(
+    arm_m: float, model: BiasModel, recording: Recording
+) -> None:
+    """Markers far from the sensor: their specific force says nothing about the unit."""
+    config = hybrid.Config(gyro_effects=(), accel_effects=("lever_arm",), remainder=False)
+    with_arm = hybrid.Model(config, model.rate_hz, {**model.tensors, "theta_accel": np.full(3, arm_m)})
+    with_arm.card = model.card
+    own, beside = (judged(each, recording.imu, MADE_FOR) for each in (model, with_arm))
+    assert beside.verdict == own.verdict == "fits"
 
 
 def test_another_name_is_doubtful_however_well_it_agrees(model: BiasModel, recording: Recording) -> None:

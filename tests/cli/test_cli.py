@@ -22,6 +22,7 @@ from imutool import cli, errors, registry
 from imutool.cli import terminal
 from imutool.cli.demo import write_asl
 from imutool.cli.terminal import epoch_line, tell_error
+from imutool.cli.train import left_out_table
 from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
 from imutool.training.fit import Epoch
@@ -362,6 +363,14 @@ def test_a_table_without_a_figure_is_left_out(capsys: pytest.CaptureFixture[str]
     terminal.figures([turned | {"roe_deg": {"5": 0.25}, "rpe_m": {"5": None}}])
     assert "ROE" in (shown := capsys.readouterr().out)
     assert "RPE" not in shown
+
+
+def test_the_mean_of_left_out_logs_is_that_of_the_logs_that_have_a_figure(capsys: pytest.CaptureFixture[str]) -> None:
+    score = {"log": "short", "model": "raw", "start": "", "aoe_deg": 1.0, "drift_m_s": None, "drift_deg": None}
+    scores = [score, score | {"log": "a", "drift_deg": 2.0}, score | {"log": "b", "drift_deg": 3.0}]
+    scores += [each | {"model": "linear", "start": "truth"} for each in scores[:2]]
+    left_out_table({"scores": scores, "parts": False, "kept": {"gyro": "linear"}})
+    assert re.search(r"mean +after 5 s +2\.50 +–", capsys.readouterr().out)
 
 
 def test_progress_tells_loss_held_out_error_and_time_left() -> None:

@@ -151,6 +151,17 @@ def test_the_imu_keeps_its_own_clock_beside_a_truth_of_as_many_rows(tmp_path):
     assert log.poses["/ground_truth/pose"].t_ns[0] == (EPOCH_S + 3) * 10**9
 
 
+def test_a_truth_without_a_time_has_that_of_the_rate_that_it_states(tmp_path):
+    columns = imu_text().splitlines()
+    imu = "\n".join(line.split(",", 1)[1] for line in columns)
+    rows = "\n".join(",".join(map(repr, row)) for row in np.column_stack([P_M, XYZW])[::2].tolist())
+    (tmp_path / "imu.csv").write_text("# sampling frequency: 100\n" + imu + "\n")
+    (tmp_path / "mocap.csv").write_text("# sampling frequency: 50\npx,py,pz,qx,qy,qz,qw\n" + rows + "\n")
+    poses = read(tmp_path).poses["/ground_truth/pose"]
+    np.testing.assert_allclose(poses.t_ns, 2e7 * np.arange(len(P_M[::2])))
+    np.testing.assert_allclose(poses.p_wb, P_M[::2], atol=1e-6)
+
+
 @pytest.mark.parametrize("rate_hz", [100.0, 50.0])  # at the first it has as many rows as the IMU
 @pytest.mark.parametrize("size", [1.0, 1e3])  # s or ms
 def test_a_truth_that_begins_at_zero_keeps_its_clock_beside_an_imu_of_this_century(tmp_path, rate_hz, size):

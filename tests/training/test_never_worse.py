@@ -95,6 +95,14 @@ def test_a_candidate_that_is_worse_from_one_start_is_not_kept() -> None:
     assert keep(from_auto + static, "gyro") == "constant", "static is better with smooth"
 
 
+def test_static_that_has_the_truth_alone_is_compared_from_the_truth() -> None:
+    """Logs in motion: `static` starts from the truth alone, where the errors of every model are smaller."""
+    auto = scores(constant=[9.0, 8.0, 7.0], linear=[2.0, 3.0, 2.5])
+    truth = [replace(score, start="truth") for score in scores(static=[0.9, 0.8, 0.7], constant=[2.0] * 3, linear=[0.7] * 3)]
+    assert keep(auto + truth, "gyro") == "linear"
+    assert not [*better_without(auto + truth, "linear")]
+
+
 def test_a_drift_counts_where_errors_of_a_whole_log_cancel() -> None:
     """Three logs: a constant is better on one of them by the AOE, and worse on all of them after 5 s."""
     aoe = {"constant": [0.8, 2.3, 2.6], "effects": [0.9, 2.3, 0.85]}
