@@ -9,10 +9,12 @@ import zlib
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from io import BytesIO
 from struct import Struct
 from typing import Any, BinaryIO
 
+from imutool.bag.records import CHUNK_LIMIT
 from imutool.recording.message_log import Message
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -20,7 +22,7 @@ RECORD_HEAD = 9  # bytes of a record ahead of its content: opcode and length
 RECORD, MESSAGE_HEAD = Struct("<BQ"), Struct("<HIQQ")  # a message: channel, sequence, log and publish times
 TIME, CRC_AT = Struct("<Q"), 24  # first in a chunk's content, and where in it its CRC is
 ATTACHMENT_HEAD = Struct("<QQI")  # two times, and bytes of the name
-FOOTER, MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = 2, 5, 6, 9, 12, 15  # opcodes; none is larger
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = 2, 3, 4, 5, 6, 9, 12, 15  # opcodes; none is larger
 RUN_BYTES = 1 << 20  # messages outside chunks are read in runs of about this size
 WRITTEN_OVER = ("rosbag2", "imutool")  # metadata whose writers write a newer record behind the one that it replaces
 _Waiting = tuple[int, int, int, int, int, bytes]  # log time, place of its chunk, number in it, channel, publish time, content
@@ -29,7 +31,6 @@ _Waiting = tuple[int, int, int, int, int, bytes]  # log time, place of its chunk
 def summary_of(reader: Any, file: BinaryIO) -> Any:
     """Summary of a log, with the definitions that its writer put nowhere but among the messages."""
     from mcap.records import Channel, Schema
-    from mcap.stream_reader import StreamReader
     from mcap.summary import Summary
 
     summary = reader.get_summary() or Summary()
@@ -37,13 +38,32 @@ def summary_of(reader: Any, file: BinaryIO) -> Any:
     schemas = {channel.schema_id for channel in summary.channels.values()} - {0}
     if summary.channels and used <= summary.channels.keys() and schemas <= summary.schemas.keys():
         return summary
-    file.seek(0)
-    for record in StreamReader(file).records:
+    for record in (record for place in records(file, summary) for record in content(file, *place)):
         if isinstance(record, Channel):
             summary.channels.setdefault(record.id, record)
         elif isinstance(record, Schema):
             summary.schemas.setdefault(record.id, record)
     return summary
+
+
+def content(file: BinaryIO, opcode: int, at: int, size: int) -> list[Any]:
+    """Definitions and messages in the record at a byte: itself or, of a chunk, what is in it; none of any other kind.
+
+    An attachment, which may be larger than memory, is not read.
+    """
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Channel, Chunk, Schema
+    from mcap.records import Message as Record
+    from mcap.stream_reader import breakup_chunk
+
+    file.seek(at + RECORD_HEAD)
+    stream = ReadDataStream(file)
+    if opcode == CHUNK:
+        chunk = Chunk.read(stream)
+        return breakup_chunk(replace(chunk, compression="", data=_unpacked(chunk), uncompressed_crc=0))
+    if opcode == MESSAGE:
+        return [Record.read(stream, size - RECORD_HEAD)]
+    return [{SCHEMA: Schema, CHANNEL: Channel}[opcode].read(stream)] if opcode in (SCHEMA, CHANNEL) else []
 
 
 def listed(records: Mapping[int, int]) -> str:
@@ -75,7 +95,7 @@ class Content:
             ATTACHMENT: self._take_attachment,
             DATA_END: self._take_end,
         }
-        for opcode, at, size in _records(summary, file):
+        for opcode, at, size in records(file, summary):
             if opcode in take:
                 take[opcode](at, size)
             elif opcode > DATA_END:
@@ -125,16 +145,20 @@ class Content:
             raise ValueError("its data have another CRC than it states")
 
 
-def _records(summary: Any, file: BinaryIO) -> Iterator[tuple[int, int, int]]:
-    """Opcode, place and size of each record of the data section; `file` is at its content."""
+def records(file: BinaryIO, summary: Any, end: int | None = None) -> Iterator[tuple[int, int, int]]:
+    """Opcode, place and size of each record of the data section, up to `end` if it was cut there; `file` is at its content.
+
+    Raises:
+        ValueError: a record that crosses the end.
+    """
     listed = {index.chunk_start_offset: index.message_index_length for index in summary.chunk_indexes}
-    end = file.seek(0, 2) - len(MAGIC)
+    last = file.seek(0, 2) - len(MAGIC) if end is None else end
     at, opcode = len(MAGIC), 0
-    while opcode not in (DATA_END, FOOTER):
+    while opcode not in (DATA_END, FOOTER) and at != end:
         file.seek(at)
         opcode, length = RECORD.unpack(file.read(RECORD_HEAD))
         size = RECORD_HEAD + length
-        if not opcode or size > end - at:
+        if size > last - at or not (opcode or end):  # zeros end a log that was cut by a loss of power
             raise ValueError(f"the record at byte {at} is none, or crosses the end")
         yield opcode, at, size
         at += size + (listed.get(at, 0) if opcode == CHUNK else 0)
@@ -177,17 +201,20 @@ def _unpacked(chunk: Any) -> bytes:
     """Records of a chunk, whose data may be several frames in a row: the library reads the first alone.
 
     Raises:
-        ValueError: data of another size or CRC than the chunk states.
+        ValueError: data of another size or CRC than the chunk states, or too large.
     """
     import lz4.frame
     import zstandard
 
     data, size = chunk.data, chunk.uncompressed_size
+    if size > CHUNK_LIMIT:
+        raise ValueError(f"a chunk says it unpacks to {size} bytes, expected at most {CHUNK_LIMIT}")
     if chunk.compression == "zstd":
         data = zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True).read(size + 1)
     elif chunk.compression == "lz4":
-        first = lz4.frame.decompress(data)  # takes a fifth of the time of the class that goes on
-        data = first if len(first) == size else lz4.frame.LZ4FrameFile(BytesIO(data)).read(size + 1)
+        first = lz4.frame.decompress_chunk(lz4.frame.create_decompression_context(), data, max_length=size + 1)
+        one_frame = first[1:] == (len(data), True)  # that takes a fifth of the time of the class that goes on
+        data = first[0] if one_frame else lz4.frame.LZ4FrameFile(BytesIO(data)).read(size + 1)
     elif chunk.compression:
         raise ValueError(f"a chunk is compressed with {chunk.compression!r}")
     if len(data) != size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):
