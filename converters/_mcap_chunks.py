@@ -23,6 +23,7 @@ RECORD, MESSAGE_HEAD = Struct("<BQ"), Struct("<HIQQ")  # a message: channel, seq
 TIME, CRC_AT = Struct("<Q"), 24  # first in a chunk's content, and where in it its CRC is
 ATTACHMENT_HEAD = Struct("<QQI")  # two times, and bytes of the name
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = 2, 3, 4, 5, 6, 9, 12, 15  # opcodes; none is larger
+MAX_NAMED = 10  # attachments or entries, in a loss
 RUN_BYTES = 1 << 20  # messages outside chunks are read in runs of about this size
 WRITTEN_OVER = ("rosbag2", "imutool")  # metadata whose writers write a newer record behind the one that it replaces
 _Waiting = tuple[int, int, int, int, int, bytes]  # log time, place of its chunk, number in it, channel, publish time, content
@@ -87,7 +88,7 @@ class Content:
         self.blocks: list[tuple[int, int, int]] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self._file, self._unchecked, self._outside, self._stated = file, 0, 0, 0
-        self._attachments, self._replaced, others = list[str](), list[str](), Counter[int]()
+        self._attachments, self._replaced, others = Counter[str](), Counter[str](), Counter[int]()
         take = {
             CHUNK: self._take_chunk,
             MESSAGE: self._take_message,
@@ -101,9 +102,9 @@ class Content:
             elif opcode > DATA_END:
                 others[opcode] += 1
         losses = {
-            "attachments are not carried over": ", ".join(self._attachments),
+            "attachments are not carried over": _first_of(self._attachments),
             "records that are none of MCAP's own are not carried over": listed(others),
-            "metadata of one name are joined, and later values replace others": ", ".join(self._replaced),
+            "metadata of one name are joined, and later values replace others": _first_of(self._replaced),
         }
         self.losses = [f"{what}: {which}" for what, which in losses.items() if which]
         chunks = f"{self._unchecked} chunks state no CRC: their messages are not checked"
@@ -132,12 +133,12 @@ class Content:
         record = Metadata.read(ReadDataStream(self._file))
         known, new = self.metadata.setdefault(record.name, {}), record.metadata
         if not record.name.startswith(WRITTEN_OVER):
-            self._replaced += [f"{key} of {record.name}" for key in known if new.get(key, known[key]) != known[key]]
+            self._replaced.update(f"{key} of {record.name}" for key in new if new[key] != known.get(key, new[key]))
         known.update(new)
 
     def _take_attachment(self, at: int, size: int) -> None:
         _, _, length = ATTACHMENT_HEAD.unpack(self._file.read(ATTACHMENT_HEAD.size))
-        self._attachments.append(self._file.read(min(length, size)).decode(errors="replace"))
+        self._attachments[self._file.read(min(length, size)).decode(errors="replace")] += 1
 
     def _take_end(self, at: int, size: int) -> None:
         self._stated = int.from_bytes(self._file.read(4), "little")
@@ -162,6 +163,12 @@ def records(file: BinaryIO, summary: Any, end: int | None = None) -> Iterator[tu
             raise ValueError(f"the record at byte {at} is none, or crosses the end")
         yield opcode, at, size
         at += size + (listed.get(at, 0) if opcode == CHUNK else 0)
+
+
+def _first_of(counts: Mapping[str, int]) -> str:
+    """First names, each with its count, and how many more there are: a log may have thousands."""
+    names = [f"{name} ({count} times)" if count > 1 else name for name, count in counts.items()]
+    return ", ".join(names[:MAX_NAMED]) + (f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else "")
 
 
 def _crc(file: BinaryIO, end: int) -> int:
