@@ -64,7 +64,8 @@ def content(file: BinaryIO, opcode: int, at: int, size: int) -> list[Any]:
         return breakup_chunk(replace(chunk, compression="", data=_unpacked(chunk), uncompressed_crc=0))
     if opcode == MESSAGE:
         return [Record.read(stream, size - RECORD_HEAD)]
-    return [{SCHEMA: Schema, CHANNEL: Channel}[opcode].read(stream)] if opcode in (SCHEMA, CHANNEL) else []
+    kind: Any = {SCHEMA: Schema, CHANNEL: Channel}.get(opcode)
+    return [] if kind is None else [kind.read(stream)]
 
 
 def listed(records: Mapping[int, int]) -> str:
