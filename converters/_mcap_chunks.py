@@ -9,16 +9,20 @@ import zlib
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from io import BytesIO
 from struct import Struct
 from typing import Any, BinaryIO
+
+from imutool.bag.records import CHUNK_LIMIT
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = 9  # bytes of a record ahead of its content: opcode and length
 RECORD, MESSAGE_HEAD = Struct("<BQ"), Struct("<HIQQ")  # a message: channel, sequence, log and publish times
 TIME, CRC_AT = Struct("<Q"), 24  # first in a chunk's content, and where in it its CRC is
 ATTACHMENT_HEAD = Struct("<QQI")  # two times, and bytes of the name
-FOOTER, MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = 2, 5, 6, 9, 12, 15  # opcodes; none is larger
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = 2, 3, 4, 5, 6, 9, 12, 15  # opcodes; none is larger
+MAX_NAMED = 10  # attachments or entries, in a loss
 RUN_BYTES = 1 << 20  # messages outside chunks are read in runs of about this size
 WRITTEN_OVER = ("rosbag2", "imutool")  # metadata whose writers write a newer record behind the one that it replaces
 _Waiting = tuple[int, int, int, int, int, bytes]  # log time, place of its chunk, number in it, channel, publish time, content
@@ -27,7 +31,6 @@ _Waiting = tuple[int, int, int, int, int, bytes]  # log time, place of its chunk
 def summary_of(reader: Any, file: BinaryIO) -> Any:
     """Summary of a log, with the definitions that its writer put nowhere but among the messages."""
     from mcap.records import Channel, Schema
-    from mcap.stream_reader import StreamReader
     from mcap.summary import Summary
 
     summary = reader.get_summary() or Summary()
@@ -35,13 +38,33 @@ def summary_of(reader: Any, file: BinaryIO) -> Any:
     schemas = {channel.schema_id for channel in summary.channels.values()} - {0}
     if summary.channels and used <= summary.channels.keys() and schemas <= summary.schemas.keys():
         return summary
-    file.seek(0)
-    for record in StreamReader(file).records:
+    for record in (record for place in records(file, summary) for record in content(file, *place)):
         if isinstance(record, Channel):
             summary.channels.setdefault(record.id, record)
         elif isinstance(record, Schema):
             summary.schemas.setdefault(record.id, record)
     return summary
+
+
+def content(file: BinaryIO, opcode: int, at: int, size: int) -> list[Any]:
+    """Definitions and messages in the record at a byte: itself or, of a chunk, what is in it; none of any other kind.
+
+    An attachment, which may be larger than memory, is not read.
+    """
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Channel, Chunk, Schema
+    from mcap.records import Message as Record
+    from mcap.stream_reader import breakup_chunk
+
+    file.seek(at + RECORD_HEAD)
+    stream = ReadDataStream(file)
+    if opcode == CHUNK:
+        chunk = Chunk.read(stream)
+        return breakup_chunk(replace(chunk, compression="", data=_unpacked(chunk), uncompressed_crc=0))
+    if opcode == MESSAGE:
+        return [Record.read(stream, size - RECORD_HEAD)]
+    kind: Any = {SCHEMA: Schema, CHANNEL: Channel}.get(opcode)
+    return [] if kind is None else [kind.read(stream)]
 
 
 def listed(records: Mapping[int, int]) -> str:
@@ -65,7 +88,7 @@ class Content:
         self.blocks: list[tuple[int, int, int]] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self._file, self._unchecked, self._outside, self._stated = file, 0, 0, 0
-        self._attachments, self._replaced, others = list[str](), list[str](), Counter[int]()
+        self._attachments, self._replaced, others = Counter[str](), Counter[str](), Counter[int]()
         take = {
             CHUNK: self._take_chunk,
             MESSAGE: self._take_message,
@@ -73,15 +96,15 @@ class Content:
             ATTACHMENT: self._take_attachment,
             DATA_END: self._take_end,
         }
-        for opcode, at, size in _records(summary, file):
+        for opcode, at, size in records(file, summary):
             if opcode in take:
                 take[opcode](at, size)
             elif opcode > DATA_END:
                 others[opcode] += 1
         losses = {
-            "attachments are not carried over": ", ".join(self._attachments),
+            "attachments are not carried over": _first_of(self._attachments),
             "records that are none of MCAP's own are not carried over": listed(others),
-            "metadata of one name are joined, and later values replace others": ", ".join(self._replaced),
+            "metadata of one name are joined, and later values replace others": _first_of(self._replaced),
         }
         self.losses = [f"{what}: {which}" for what, which in losses.items() if which]
         chunks = f"{self._unchecked} chunks state no CRC: their messages are not checked"
@@ -110,12 +133,12 @@ class Content:
         record = Metadata.read(ReadDataStream(self._file))
         known, new = self.metadata.setdefault(record.name, {}), record.metadata
         if not record.name.startswith(WRITTEN_OVER):
-            self._replaced += [f"{key} of {record.name}" for key in known if new.get(key, known[key]) != known[key]]
+            self._replaced.update(f"{key} of {record.name}" for key in new if new[key] != known.get(key, new[key]))
         known.update(new)
 
     def _take_attachment(self, at: int, size: int) -> None:
         _, _, length = ATTACHMENT_HEAD.unpack(self._file.read(ATTACHMENT_HEAD.size))
-        self._attachments.append(self._file.read(min(length, size)).decode(errors="replace"))
+        self._attachments[self._file.read(min(length, size)).decode(errors="replace")] += 1
 
     def _take_end(self, at: int, size: int) -> None:
         self._stated = int.from_bytes(self._file.read(4), "little")
@@ -123,19 +146,29 @@ class Content:
             raise ValueError("its data have another CRC than it states")
 
 
-def _records(summary: Any, file: BinaryIO) -> Iterator[tuple[int, int, int]]:
-    """Opcode, place and size of each record of the data section; `file` is at its content."""
+def records(file: BinaryIO, summary: Any, end: int | None = None) -> Iterator[tuple[int, int, int]]:
+    """Opcode, place and size of each record of the data section, up to `end` if it was cut there; `file` is at its content.
+
+    Raises:
+        ValueError: a record that crosses the end.
+    """
     listed = {index.chunk_start_offset: index.message_index_length for index in summary.chunk_indexes}
-    end = file.seek(0, 2) - len(MAGIC)
+    last = file.seek(0, 2) - len(MAGIC) if end is None else end
     at, opcode = len(MAGIC), 0
-    while opcode not in (DATA_END, FOOTER):
+    while opcode not in (DATA_END, FOOTER) and at != end:
         file.seek(at)
         opcode, length = RECORD.unpack(file.read(RECORD_HEAD))
         size = RECORD_HEAD + length
-        if not opcode or size > end - at:
+        if size > last - at or not (opcode or end):  # zeros end a log that was cut by a loss of power
             raise ValueError(f"the record at byte {at} is none, or crosses the end")
         yield opcode, at, size
         at += size + (listed.get(at, 0) if opcode == CHUNK else 0)
+
+
+def _first_of(counts: Mapping[str, int]) -> str:
+    """First names, each with its count, and how many more there are: a log may have thousands."""
+    names = [f"{name} ({count} times)" if count > 1 else name for name, count in counts.items()]
+    return ", ".join(names[:MAX_NAMED]) + (f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else "")
 
 
 def _crc(file: BinaryIO, end: int) -> int:
@@ -175,17 +208,20 @@ def _unpacked(chunk: Any) -> bytes:
     """Records of a chunk, whose data may be several frames in a row: the library reads the first alone.
 
     Raises:
-        ValueError: data of another size or CRC than the chunk states.
+        ValueError: data of another size or CRC than the chunk states, or too large.
     """
     import lz4.frame
     import zstandard
 
     data, size = chunk.data, chunk.uncompressed_size
+    if size > CHUNK_LIMIT:
+        raise ValueError(f"a chunk says it unpacks to {size} bytes, expected at most {CHUNK_LIMIT}")
     if chunk.compression == "zstd":
         data = zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True).read(size + 1)
     elif chunk.compression == "lz4":
-        first = lz4.frame.decompress(data)  # takes a fifth of the time of the class that goes on
-        data = first if len(first) == size else lz4.frame.LZ4FrameFile(BytesIO(data)).read(size + 1)
+        first = lz4.frame.decompress_chunk(lz4.frame.create_decompression_context(), data, max_length=size + 1)
+        one_frame = first[1:] == (len(data), True)  # that takes a fifth of the time of the class that goes on
+        data = first[0] if one_frame else lz4.frame.LZ4FrameFile(BytesIO(data)).read(size + 1)
     elif chunk.compression:
         raise ValueError(f"a chunk is compressed with {chunk.compression!r}")
     if len(data) != size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):

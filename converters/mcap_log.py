@@ -19,7 +19,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._mcap_chunks import MAGIC, RECORD_HEAD, Content, in_order, listed, summary_of
+from ._mcap_chunks import MAGIC, RECORD_HEAD, Content, content, in_order, listed, records, summary_of
 from ._ros_types import plain_cdr
 from ._source import find_files, find_folders, head, name, with_suffix
 
@@ -236,17 +236,16 @@ def _whole_size(path: Path) -> int:
 
 def _unfinished(path: Path, images: bool) -> Iterator[Message]:
     """Messages of a log without an end, in log-time order within each chunk."""
-    from mcap.records import Channel, Chunk, Schema
+    from mcap.records import Channel, Schema
     from mcap.records import Message as Record
-    from mcap.stream_reader import StreamReader, breakup_chunk
+    from mcap.summary import Summary
 
     schemas: dict[int, Any] = {}
     topics: dict[int, MessageTopic] = {}
     end = _whole_size(path)
     with _refusing(path), path.open("rb") as file:
-        for record in StreamReader(file, emit_chunks=True, validate_crcs=True).records:
-            parts = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
-            for part in sorted(parts, key=lambda part: part.log_time if isinstance(part, Record) else -1):
+        for place in records(file, Summary(), end):
+            for part in sorted(content(file, *place), key=lambda part: part.log_time if isinstance(part, Record) else -1):
                 if isinstance(part, Schema):
                     schemas[part.id] = part
                 elif isinstance(part, Channel):
@@ -254,8 +253,6 @@ def _unfinished(path: Path, images: bool) -> Iterator[Message]:
                 elif isinstance(part, Record) and (images or not re.fullmatch(IMAGES, topics[part.channel_id].schema_name)):
                     topic = topics[part.channel_id]
                     yield Message(topic, part.log_time, part.publish_time, _plain(topic, part.data))
-            if file.tell() >= end:
-                return
 
 
 def _reader(file: Any) -> Any:

@@ -35,6 +35,7 @@ from imutool.bias_start.initial_bias import (
 )
 from imutool.bias_start.stretches import Sieve, measured
 from imutool.cleaning import Survey, cleaned
+from imutool.cleaning.samples import refuse_mixed
 from imutool.cleaning.survey import raw_batches
 from imutool.cleaning.truth import read_truth
 from imutool.errors import ConfigError, DataError, LogError, ModelError
@@ -124,6 +125,8 @@ def choose_model_and_start(
     log: Log, topic: str, name: str | Path | None, init: str, smooth: bool, survey: Survey | None, force: bool
 ) -> tuple[BiasModel, InitialBias]:
     """Bias model and initial bias for one IMU of a log."""
+    if survey is None and not force:
+        refuse_mixed(raw_batches(log, topic), topic, log.path)
     untrained = name is None or str(name) == static.Model.method
     first_minute = _first_minute(log, topic, init, survey)
     period_s, start_ns = first_minute.imu.period_s, int(first_minute.imu.t_ns[0])

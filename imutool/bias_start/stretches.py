@@ -7,7 +7,6 @@ stretch, and counts as at most `MAX_GAP_S`.
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -19,7 +18,7 @@ from imutool.bias.model import GAP_S
 from imutool.cleaning import rows
 from imutool.cleaning.rules.saturation import at_limit
 from imutool.cleaning.rules.stuck import repeated
-from imutool.cleaning.samples import count_frame, frame_words
+from imutool.cleaning.samples import FrameCounts
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.file_location import Location
 from imutool.mcap_io.codec.decode import ImuBatch
@@ -211,7 +210,7 @@ class Sieve:
     clock: StretchClock = field(default_factory=StretchClock)
     left_out: dict[str, int] = field(default_factory=dict)
     first_ns: int = 0  # stamp of the first sample that was left out
-    frames: Counter[str] = field(default_factory=Counter)  # messages by the frame that they name
+    frames: FrameCounts = field(default_factory=FrameCounts)
 
     def __call__(self, batch: ImuBatch) -> tuple[ImuBatch, Int64[np.ndarray, " n"]]:
         """Measured samples and their times (ns).
@@ -219,7 +218,7 @@ class Sieve:
         Raises:
             LogError: a stamp that repeats, or goes back by less than `GAP_S`.
         """
-        count_frame(batch, self.frames)
+        self.frames.add(batch)
         reasons = unmeasured(batch.gyro, batch.accel)
         bad = np.logical_or.reduce(list(reasons.values()))
         if bad.any():
@@ -245,7 +244,7 @@ class Sieve:
             total = sum(self.left_out.values())
             kinds = described(self.left_out)
             yield f"{total} samples are no measurement and left out ({kinds}), the first at {self.first_ns} ns"
-        yield from frame_words(self.frames)
+        yield from self.frames.words()
         yield from jump_warnings([stretch for stretch in self.clock.stretches if stretch.jump])
 
     def record(self) -> dict[str, str]:

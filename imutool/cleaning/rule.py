@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from typing import Annotated, ClassVar
@@ -15,7 +15,7 @@ from imutool import registry
 from imutool.array_types import Float64, Int64
 from imutool.cleaning.conventions import Conventions, judge
 from imutool.cleaning.finding import Finding
-from imutool.cleaning.samples import Motion, Numbers, Samples
+from imutool.cleaning.samples import FrameCounts, Motion, Numbers, Samples
 from imutool.cleaning.truth import Truth
 from imutool.cleaning.unit_evidence import FORCES, accel_reading
 from imutool.config import Settings
@@ -91,7 +91,7 @@ class TopicSummary:
     messages: int
     motion: Motion
     truth: Truth | None
-    frames: Mapping[str, int] = field(default_factory=dict)
+    frames: FrameCounts = field(default_factory=FrameCounts)
     scale: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.ones(6))
     axes: Float64[np.ndarray, "2 3 3"] = field(default_factory=lambda: np.stack([np.eye(3)] * 2))
     mount: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from imutool.array_types import Bool, Float64, Int64
+from imutool.errors import LogError
+from imutool.file_location import Location
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import nanoseconds
 
@@ -16,6 +18,8 @@ BLOCK = 4096  # samples: what rules see at a time depends on the log alone, not 
 STEP_NS = nanoseconds(0.1)
 STEP_S = 0.1  # of `Motion`
 MAX_FRAMES = 4  # that a warning names
+FIRST_MESSAGES = 1000  # that show whether sensors take turns
+MAX_CHANGES = 0.1  # of the frame, by messages: more are of sensors that take turns
 MAX_COUNTED = 1000  # a hostile log names another frame in each message
 MAX_RATES = 20_000  # samples of the gyro that are kept as they are: 480 kB
 
@@ -40,27 +44,55 @@ def joined(parts: list[Samples]) -> Samples:
     return parts[0] if len(parts) == 1 else Samples(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def counted_frames(batches: Iterable[ImuBatch], frames: Counter[str]) -> Iterator[ImuBatch]:
+class FrameCounts(Counter[str]):
+    """Messages by the frame that they name, and how often it changes from one to the next."""
+
+    changes = 0
+    last: str | None = None
+
+    def add(self, batch: ImuBatch) -> None:
+        """Add the messages of a batch, which all name one frame."""
+        frame = batch.frame_id.lstrip("/")
+        self.changes += self.last not in (None, frame)
+        self.last = frame
+        if frame in self or len(self) < MAX_COUNTED:
+            self[frame] += len(batch.stamp_ns)
+
+    def words(self) -> list[str]:
+        """Warning about an IMU whose messages name several frames; no name is no frame."""
+        named = [f"{frame} ({count})" for frame, count in self.items() if frame]
+        if len(named) < 2:
+            return []
+        some = ", ".join(named[:MAX_FRAMES]) + ", …" * (len(named) > MAX_FRAMES)
+        return [f"the messages name {len(named)} frames: {some}; several sensors have no common bias"]
+
+    def mixed(self) -> str:
+        """Reason not to use samples of sensors that take turns; empty where one sensor may have had several names."""
+        named = sorted(frame for frame in self if frame)
+        takes_turns = 2 <= len(named) <= MAX_FRAMES and self.changes > self.total() * MAX_CHANGES
+        return f"{len(named)} sensors take turns on the topic ({', '.join(named)})" if takes_turns else ""
+
+
+def counted_frames(batches: Iterable[ImuBatch], frames: FrameCounts) -> Iterator[ImuBatch]:
     """The batches; their messages are counted by frame as they come."""
     for batch in batches:
-        count_frame(batch, frames)
+        frames.add(batch)
         yield batch
 
 
-def count_frame(batch: ImuBatch, frames: Counter[str]) -> None:
-    """Add the messages of a batch to those of its frame."""
-    frame = batch.frame_id.lstrip("/")
-    if frame in frames or len(frames) < MAX_COUNTED:
-        frames[frame] += len(batch.stamp_ns)
+def refuse_mixed(batches: Iterable[ImuBatch], topic: str, where: Location) -> None:
+    """Refuse an IMU on whose topic sensors take turns, by its first messages.
 
-
-def frame_words(frames: Mapping[str, int]) -> list[str]:
-    """Warning about an IMU whose messages name several frames; no name is no frame."""
-    named = [f"{frame} ({count})" for frame, count in frames.items() if frame]
-    if len(named) < 2:
-        return []
-    some = ", ".join(named[:MAX_FRAMES]) + ", …" * (len(named) > MAX_FRAMES)
-    return [f"the messages name {len(named)} frames: {some}; several sensors have no common bias"]
+    Raises:
+        LogError: they do.
+    """
+    frames = FrameCounts()
+    for _ in counted_frames(batches, frames):
+        if frames.total() >= FIRST_MESSAGES:
+            break
+    if mixed := frames.mixed():
+        fix = "Record each on a topic of its own, or set `force`"
+        raise LogError(f"{topic}: {mixed}", where=where, expected="the messages of one sensor", fix=fix)
 
 
 def blocks(batches: Iterable[ImuBatch]) -> Iterator[Samples]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -17,7 +16,7 @@ from imutool.cleaning.finding import Finding, FindingReport, Verdict, score, ver
 from imutool.cleaning.likelihood import axis_names
 from imutool.cleaning.rule import GROUP, CleaningSettings, Rule, TopicSummary
 from imutool.cleaning.rules.gaps import MISSING
-from imutool.cleaning.samples import Motion, Samples, blocks, counted_frames
+from imutool.cleaning.samples import FrameCounts, Motion, Samples, blocks, counted_frames
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
@@ -236,7 +235,7 @@ def _through(
     The second value is the topic's totals.
     """
     stages = dict(sorted(rules.items(), key=lambda item: item[1].place))
-    motion, messages, frames = Motion(), 0, Counter[str]()
+    motion, messages, frames = Motion(), 0, FrameCounts()
 
     def received() -> Iterator[Samples]:
         nonlocal messages

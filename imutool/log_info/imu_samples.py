@@ -17,7 +17,7 @@ from imutool.cleaning import raw_batches
 from imutool.cleaning.rules.gaps import missing
 from imutool.cleaning.rules.not_finite import measured
 from imutool.cleaning.rules.saturation import AxisLimits
-from imutool.cleaning.samples import Samples, blocks, counted_frames, joined
+from imutool.cleaning.samples import FrameCounts, Samples, blocks, counted_frames, joined
 from imutool.cleaning.stamp_line import Stamps, distinct, read_stamps, restamped, usual_period
 from imutool.log_info.clock import IncreasingStamps, SensorStamps, sorted_stamps
 from imutool.log_info.report import Interval
@@ -53,7 +53,7 @@ class ImuSamples:
         self._limits = AxisLimits(6)
         self._rank: Int64[np.ndarray, " n"] | None = None  # of each message among the samples, -1 of those that are none
         self._lag_ns = np.inf, -np.inf  # of the log times behind the stamps
-        self.frames = Counter[str]()
+        self.frames = FrameCounts()
         recorded, self.sound = SensorStamps(), IncreasingStamps()
         self.stamps, messages, finite = NO_FAULTS, 0, 0
         for samples in blocks(counted_frames(raw_batches(log, topic), self.frames)):

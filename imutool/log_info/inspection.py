@@ -15,7 +15,6 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.cleaning.rules import saturation
 from imutool.cleaning.rules.gaps import pause_words
-from imutool.cleaning.samples import frame_words
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.file_location import Location, log_name
 from imutool.inertial.stationary import Batch, Blocks, block_statistics, resting_blocks
@@ -247,7 +246,7 @@ def _imu_warnings(imu: ImuSamples) -> list[str]:
     }
     warnings = [f"{n} sample{'s' * (n != 1)} {text}" for key, text in words.items() if (n := imu.counts[key])]
     warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in imu.stamps.faults]
-    warnings += [*frame_words(imu.frames), *pause_words(imu.sound.long_ns), *jump_warnings(imu.jumps)]
+    warnings += [*imu.frames.words(), *pause_words(imu.sound.long_ns), *jump_warnings(imu.jumps)]
     if len(imu) > 1 and imu.period_s < MIN_PERIOD_S and not imu.stamps.faults:
         warnings.append(f"{1.0 / imu.period_s:.3g} samples a second: the stamps are not in nanoseconds, or were never set")
     return warnings

@@ -5,10 +5,13 @@ from __future__ import annotations
 import functools
 import json
 import struct
+import tracemalloc
 from base64 import b64decode
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -18,6 +21,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imutool.conversion.run import convert as convert_logs
 from imutool.converters import mcap_log
+from imutool.errors import DataError
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.flatbuffer import FlatBuffer
 from imutool.mcap_io.log import Log
@@ -336,3 +340,22 @@ def test_a_chunk_of_several_frames_is_read_and_converted(tmp_path, monkeypatch, 
     convert_logs(tmp_path / "in.mcap", tmp_path / "out.mcap")
     for log in ("in.mcap", "out.mcap"):
         np.testing.assert_array_equal(read(tmp_path / log).imu.gyro, GYRO)
+
+
+@pytest.mark.parametrize("what", ["expands", "states", "attachment"])
+def test_what_a_log_without_a_summary_would_unpack_to_or_attach_takes_no_memory(tmp_path, what):
+    """The chunk unpacked as a whole, and the attachment was read for the definitions behind it."""
+    size = 1000 if what == "expands" else 2**40
+    packed = lz4.frame.compress(bytes(100 << 20)) if what == "expands" else b""
+    chunk = struct.pack("<QQQII3sQ", 1, 1, size, 0, 3, b"lz4", len(packed)) + packed
+    attachment = struct.pack("<QQIIQ", 1, 1, 0, 0, 100 << 20) + bytes((100 << 20) + 4)
+    opcode, content = (9, attachment) if what == "attachment" else (6, chunk)
+    end = struct.pack("<BQI", 15, 4, 0) + struct.pack("<BQQQI", 2, 20, 0, 0, 0)
+    log = mcap_log.MAGIC + struct.pack("<BQII", 1, 8, 0, 0) + struct.pack("<BQ", opcode, len(content)) + content + end
+    (tmp_path / "in.mcap").write_bytes(log + mcap_log.MAGIC)
+    tracemalloc.start()
+    with nullcontext() if what == "attachment" else pytest.raises(DataError, match=f"{size} bytes"):
+        mcap_log.read_sequence(*mcap_log.sequences(tmp_path / "in.mcap"), images=True)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10 << 20

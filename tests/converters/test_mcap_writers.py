@@ -98,13 +98,14 @@ def test_what_no_index_lists_is_converted_or_said(convert, tmp_path, statistics)
     more = [build(Message(1, t, row.tobytes(), t, 0)) for t, row in zip(later, rows, strict=True)]
     unlisted = b"".join([*more[100:], b"\x90" + bytes(8)])
     chunk = Chunk("", unlisted, later[-1], later[100], 0, len(unlisted))
-    rig = [build(Metadata("rig", {"mount": place})) for place in ("roof", "floor")]
+    rig = [build(Metadata("rig", {f"mount{n}": place for n in range(12)})) for place in ("roof", "floor", "hall")]
     _append(source, b"".join([*more[:100], build(chunk), *rig, b"\x80" + bytes(8)]))
     done = convert(source, tmp_path / "out.mcap")
     assert done.returncode == 3, done.stderr
     assert "not carried over: 1 of 0x80" in done.stderr
     assert "records in chunks that are none of MCAP's own are not carried over: 1 of 0x90" in done.stderr
-    assert "later values replace others: mount of rig" in done.stderr
+    assert "later values replace others: mount0 of rig (2 times), mount1 of rig" in done.stderr
+    assert "mount9 of rig (2 times) and 2 more" in done.stderr
     assert "100 messages lie outside chunks" in done.stderr
     assert read(tmp_path / "out.mcap").imu.t_ns.tolist() == [*T_NS.tolist(), *later]
 

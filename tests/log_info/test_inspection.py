@@ -480,5 +480,8 @@ def test_two_sensors_on_one_topic_are_named(tmp_path: Path, caplog: pytest.LogCa
     assert [(finding.rule, finding.what) for finding in survey(path).findings] == [("frames", said)]
     with Log(path) as log:
         assert look(log, "/imu", CleaningSettings(without=("frames",))).score == 1.0
-    debias(path, tmp_path / "out.mcap")
+    for clean in (None, CleaningSettings()):
+        with pytest.raises(LogError, match="2 sensors take turns on the topic"):  # it took the mean of both after a minute
+            debias(path, tmp_path / "out.mcap", clean=clean)
+    debias(path, tmp_path / "out.mcap", force=True)
     assert f"/imu: {said}" in caplog.text

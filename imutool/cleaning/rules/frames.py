@@ -1,12 +1,11 @@
-"""Frames: messages of one topic that name several, as two sensors on it do."""
+"""Frames: messages of one topic that name several, as two sensors on it do; those that take turns have no common bias."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from imutool.cleaning.finding import Finding
+from imutool.cleaning.finding import Finding, Severity
 from imutool.cleaning.rule import Rule, TopicSummary
-from imutool.cleaning.samples import frame_words
 
 
 class Frames(Rule):
@@ -16,4 +15,6 @@ class Frames(Rule):
 
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """Finding about the frames."""
-        yield from (Finding("frames", "warning", what, len(whole.frames)) for what in frame_words(whole.frames))
+        distrust = whole.frames.mixed()
+        severity: Severity = "error" if distrust else "warning"
+        yield from (Finding("frames", severity, what, len(whole.frames), distrust=distrust) for what in whole.frames.words())

@@ -165,7 +165,7 @@ class Recordings:
         misfits = [channel for channel in unusual if not self._fits(found.block, channel, recording)]
         met = [channel for channel in misfits if channel in recording.samples]
         fitted = any(self._fits(recording.samples[channel], channel, recording) for channel in met)
-        others = (recording.readable() & found.sizes.keys()) - set(misfits)
+        others = (recording.readable() & found.sizes.keys()) - set(misfits) if misfits else ()
         wrong = found.evidence and any(self._fits(found.block, channel, recording) for channel in others)
         return fitted or (len(met) < len(misfits) and not wrong)
 
