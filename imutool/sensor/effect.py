@@ -295,5 +295,5 @@ def in_stage_order(acting: Acting) -> list[tuple[Effect, Theta]]:
 
 
 def stage_order(effect: Effect) -> tuple[int, int, str]:
-    """Sorting key of an effect: its stage, then its place within it, then its key."""
-    return effect.stage, WITHIN_STAGE.get(effect.key, WITHIN_STAGE.get(effect.name, int(effect.of_time))), effect.key  # S M omega + G f + b (Rehder 2016)
+    """Sorting key of an effect: stage, place within it, key: S M omega + G f + b (Rehder 2016)."""
+    return effect.stage, WITHIN_STAGE.get(effect.key, WITHIN_STAGE.get(effect.name, int(effect.of_time))), effect.key

@@ -35,7 +35,7 @@ def in_both_forms(effects: Sequence[Effect]) -> Iterator[Effect]:
 
 
 def _from_one_time_on(whole: Effect) -> Effect:
-    """The scale error of a sensor that sets in, or the rotation of a mount: its size, then the time (s from the log's start)."""
+    """A scale error that sets in, or a mount that slips: its size, then the time (s from the log's start)."""
     if whole.name == mount_rotation.EFFECT.name:
         return replace(mount_rotation.slipping(T_STEP), variant=STEP)
     sensor: Sensor = "gyro" if whole.sensors == ("gyro",) else "accel"
