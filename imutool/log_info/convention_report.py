@@ -77,7 +77,7 @@ def convention_warnings(whole: TopicSummary) -> list[str]:
 
 
 def contradictions(whole: TopicSummary) -> list[str]:
-    """Sentences on a gyro or an accelerometer whose axes the motion contradicts, and on stops that poses contradict."""
+    """Sentences on axes that the motion contradicts, and on stops that the poses contradict."""
     return [*(finding.what for finding in Axes().findings(whole) if finding.severity == "error"), *turns_at_stops(whole)]
 
 

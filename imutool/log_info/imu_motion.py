@@ -64,7 +64,7 @@ def blocks_of(imu: Imu) -> Iterator[Samples]:
 
 
 def turns_at_stops(whole: TopicSummary) -> Iterator[str]:
-    """Sentence on a steady turn of the true poses where the samples look like a stop: its rate is taken for a bias."""
+    """Sentence on a steady turn of the true poses where the samples look like a stop."""
     if whole.truth is None or len(whole.truth.t_ns) <= STOP_STEPS or not whole.motion.samples:
         return
     caps, (step, mean) = StationarySettings(), whole.motion.table()

@@ -156,8 +156,8 @@ def limits(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAU
         own = [a for a in range(3 * k, 3 * k + 3) if moves[a]]
         varied = [a for a in own if len(np.unique(real[:, a])) > MIN_ROWS]
         by_axis = {f"{signal}_{AXES[a % 3]}": _limit(real[:, [a]], settings) for a in varied}
-        common, least = _limit(real[:, own], settings), OWN_LIMIT * float(np.abs(real[:, own]).max(initial=0.0))
-        highest |= {signal: common} if common else {key: limit for key, limit in by_axis.items() if limit > least}
+        common, minimum = _limit(real[:, own], settings), OWN_LIMIT * float(np.abs(real[:, own]).max(initial=0.0))
+        highest |= {signal: common} if common else {key: limit for key, limit in by_axis.items() if limit > minimum}
     return highest
 
 

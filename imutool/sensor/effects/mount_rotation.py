@@ -1,4 +1,4 @@
-"""Rotation of the mount: the axes of both sensors against the body's; with `t_step` from one time on."""
+"""Rotation of the mount: the axes of both sensors against the body's; it may slip."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _slipped(samples: SensorSamples, theta: Theta) -> SensorSamples:
 
 
 def _slips(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
-    """The likeliest time at which a mount slips, beside what most other errors follow: v changes by v x phi."""
+    """The likeliest slip of a mount, by which v changes to v + v x phi."""
     t_s = samples.stamp_s
     ideal = motion.sample(t_s, t_s)
     basis = orthonormal(np.column_stack([np.ones(len(t_s)), followed(ideal)]))

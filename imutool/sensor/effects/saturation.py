@@ -27,7 +27,7 @@ def _forward(samples: SensorSamples, limits: Theta) -> SensorSamples:
 
 
 def of_form(effect: Effect, names: Container[str]) -> Effect:
-    """The saturation with limits of single axes if one is among the names, any other effect itself."""
+    """The saturation with limits of axes if one is named, any other effect itself."""
     of_axes = effect.name == EFFECT.name and any(p.name in names for p in OF_AXES)
     return replace(effect, parameters=(*effect.parameters, *OF_AXES)) if of_axes else effect
 
@@ -39,7 +39,7 @@ def _starts(_motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
 
 
 def of_limit(key: str) -> tuple[str, Sensor, slice]:
-    """Parameter, sensor and columns of a limit by its sensor, or sensor and axis (`gyro_x`)."""
+    """Parameter, sensor and columns of the limit of a sensor or an axis (`gyro_x`)."""
     k = next(k for k, sensor in enumerate(SENSORS) if key.startswith(sensor))
     axis = key.removeprefix(SENSORS[k])
     first = 3 * k + (AXES.index(axis[1:]) if axis else 0)
