@@ -73,7 +73,7 @@ class IdentifiedNoise:
     topic: str
     noise: Noise
     at_most: Mapping[Sensor, list[float | None]]  # upper bound of each sensor's density from rest
-    samples: Mapping[Sensor, Float64[np.ndarray, "3"]]  # density of each sensor from the second differences of its samples
+    samples: Mapping[Sensor, Float64[np.ndarray, "3"]]  # density of each sensor from the differences of its samples
     at_rest: CurveSource | None
     in_motion: CurveSource | None
     remarks: list[str]
@@ -109,7 +109,7 @@ def identify(
     except DataError as error:
         remarks.append(f"in motion: {error.what}")
     period_s = allan.sample_period_s(recording.imu)
-    samples = {sensor: CALM * white_noise(getattr(recording.imu, sensor)) * np.sqrt(period_s) for sensor in SENSORS}
+    samples = {sensor: CALM * white_noise(getattr(recording.imu, sensor), period_s) * np.sqrt(period_s) for sensor in SENSORS}
     at_most = dict.fromkeys(SENSORS, UNKNOWN) if rest is None else rest.at_most
     combined = _combine(rest, motion, samples, at_most, period_s, remarks)
     if rest is None and motion is None:
@@ -288,7 +288,7 @@ def rows(identified: IdentifiedNoise) -> list[tuple[str, ...]]:
         if identified.at_rest is not None and None in getattr(identified.noise, name):
             table.append((f"{name} at most", *map(_number, identified.at_most[sensor]), unit, identified.at_rest.how))
         differences = map(_number, identified.samples[sensor])
-        table.append((f"{name} of samples", *differences, unit, "second differences while the samples are calm"))
+        table.append((f"{name} of samples", *differences, unit, "differences while the samples are calm"))
         if motion is not None:
             axes = {f"{sensor}_{kind}": motion.axes(sensor, kind) for kind in ("density", "walk")}
             table += [(f"{n} in motion", *map(_number, v), UNITS[n], motion.how) for n, v in axes.items() if v != UNKNOWN]

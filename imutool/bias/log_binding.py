@@ -61,13 +61,13 @@ def at_rate(model: BiasModel, rate_hz: float, where: object, t_ns: Stamps | None
 def other_conditions(model: BiasModel, samples: tuple[Float64[np.ndarray, " n"], Rows3, Rows3]) -> list[str]:
     """Sentences on noise and rate of some samples that the training logs did not have."""
     sentences = []
-    noise = white_noise(np.concatenate([samples[1], samples[2]], axis=1))
+    steps = np.diff(samples[0])
+    shorter, period_s, longer = (float(quantile(steps, share)) for share in (0.25, 0.5, 0.75))
+    noise = white_noise(np.concatenate([samples[1], samples[2]], axis=1), period_s)
     known = model.noise_std > 0
     ratio = float((noise[known] / model.noise_std[known]).max()) if known.any() else 0.0
     if ratio > MAX_NOISE:  # less noise is no doubt: a drone in the hand has a tenth of that in flight
         sentences.append(f"the samples are {ratio:.0f} times as noisy as in the training runs: another sensor, or vibration")
-    steps = np.diff(samples[0])
-    shorter, period_s, longer = (float(quantile(steps, share)) for share in (0.25, 0.5, 0.75))
     rate_hz, scatter = 1.0 / period_s, (longer - shorter) / period_s / math.sqrt(len(steps))  # of the median of uneven steps
     if model.rate_hz and abs(rate_hz / model.rate_hz - 1.0) > MAX_RATE + SURE * scatter:
         sentences.append(f"samples at {rate_hz:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")

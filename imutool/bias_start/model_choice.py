@@ -265,7 +265,7 @@ def _samples(log: Log, topic: str, survey: Survey | None, end_ns: int | None) ->
 
 def _noise(imu: Imu) -> Float64[np.ndarray, "6"]:
     """White noise of a sample, for a model without noise figures and a log without rest."""
-    return white_noise(np.concatenate([imu.gyro, imu.accel], axis=1))
+    return white_noise(np.concatenate([imu.gyro, imu.accel], axis=1), imu.period_s)
 
 
 def estimate_at_rest(imu: Imu, where: str | Location) -> tuple[BiasModel, InitialBias]:

@@ -104,8 +104,8 @@ def _converter_output(samples: Float64[np.ndarray, "n k"], findings: Sequence[Fi
     values = {name: estimate.value for finding in findings for name, estimate in finding.parameters.items()}
     for k, sensor in enumerate(SENSORS):
         part, limit, lsb = slice(3 * k, 3 * k + 3), values.get(f"{sensor}_limit"), values.get(f"{sensor}_lsb")
-        if limit is not None and np.isfinite(limit):
-            out[:, part] = np.clip(out[:, part], -limit, limit)
+        own = [values.get(f"{sensor}_limit_{axis}", np.inf if limit is None else limit) for axis in AXES]
+        out[:, part] = np.clip(out[:, part], -np.array(own), own)
         if lsb is not None:
             out[:, part] = lsb * np.rint(out[:, part] / lsb)
     return out

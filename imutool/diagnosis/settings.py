@@ -183,6 +183,7 @@ class SearchSettings(Settings, frozen=True):
     white_kurtosis: Positive = 6.0  # of an axis' white residuals, from which on few samples hold the squares (noise has 3)
     hysteresis_leaves: Share = 0.1  # of its squares, at most, in slow motion of its sensor: it fits a part of many a misfit
     larger_misfit: Positive = 10.0  # times the squares of an effect, in slow motion against a simulation: it is a part of that
+    contradicted_share: Share = 0.1  # of what an effect removes of one sensor, at most, what it adds to another
     exchanged_effects: Count = 3  # up to which each is compared with replacements
     give_up_factor: Positive = 4.0  # over the needed squares: a fit as far off after a few steps gets no nearer
     rivals: Annotated[int, msgspec.Meta(ge=0)] = 3  # effects that are tried in another's place for `similar`

@@ -33,6 +33,7 @@ TREND_DEVIATIONS = 4.0  # of the difference of two means; real stops reach 2.1, 
 FLOOR_MARGIN = 2.5  # ratio to the calmest windows of the log
 FLOOR_RANK = 10  # rank of the window that sets the floor: a single stuck window must not
 NOISE_BLOCK, CALMEST = 20, 0.25
+SLOW_S = 0.015  # at 50 Hz second differences of a drone or a hand show 1.4 to 4.5 times the noise, at 25 Hz 4 to 20 times
 CALM = 1.2  # times `white_noise`, that pure white noise is
 MEANS, MIN_MEANS = (20, 200), 8  # samples of a mean of noise, and how many means there are at least
 TOLERATED_MEAN = 1.8  # by which they may scatter more than noise is measured, which finds five sixths of it
@@ -233,17 +234,19 @@ def _rate_at_rest(means: Float64[np.ndarray, "n 3"], noise: Float64[np.ndarray, 
     return np.asarray(often[np.argmin(np.linalg.norm(often, axis=1))])
 
 
-def white_noise(values: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]:
+def white_noise(values: Float64[np.ndarray, "n k"], period_s: float = 0.0) -> Float64[np.ndarray, " k"]:
     """White noise of a sample (standard deviation) from calm second differences.
 
-    The variance of second differences is 6 sigma², with little motion in it. The figure is the lower quartile over blocks of
+    The variance of differences of order m is C(2m, m) sigma², with little motion in it. In samples more than `SLOW_S` apart,
+    second differences hold the motion of a hand, and sixth ones are taken. The figure is the lower quartile over blocks of
     `NOISE_BLOCK` samples: five sixths of pure white noise. Zero for fewer samples than a block.
     """
-    second = np.diff(values, n=2, axis=0) ** 2
-    if len(second) < NOISE_BLOCK:
+    order = 6 if period_s > SLOW_S else 2
+    squares = np.diff(values, n=order, axis=0) ** 2 if len(values) > order else values[:0]
+    if len(squares) < NOISE_BLOCK:
         return np.zeros(values.shape[1])
-    blocks = second[: len(second) // NOISE_BLOCK * NOISE_BLOCK].reshape(-1, NOISE_BLOCK, values.shape[1]).mean(axis=1)
-    return np.asarray(np.sqrt(quantile(blocks, CALMEST) / 6.0))
+    blocks = squares[: len(squares) // NOISE_BLOCK * NOISE_BLOCK].reshape(-1, NOISE_BLOCK, values.shape[1]).mean(axis=1)
+    return np.asarray(np.sqrt(quantile(blocks, CALMEST) / math.comb(2 * order, order)))
 
 
 def nothing_but_noise(x: Float64[np.ndarray, " n"], minimum: float = 0.0) -> bool:

@@ -19,7 +19,7 @@ from imutool.cleaning.stamp_line import read_stamps
 from imutool.cleaning.truth import Truth, truth_of
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.errors import DataError
-from imutool.log_info.imu_motion import ImuMotion, blocks_of, motion_of
+from imutool.log_info.imu_motion import ImuMotion, blocks_of, motion_of, turns_at_stops
 from imutool.log_info.pose_imu_rotation import (
     BY_HAND,
     CORRECTION,
@@ -72,8 +72,8 @@ def convention_warnings(whole: TopicSummary) -> list[str]:
 
 
 def contradictions(whole: TopicSummary) -> list[str]:
-    """Sentences on a gyro or an accelerometer whose axes the motion contradicts."""
-    return [finding.what for finding in Axes().findings(whole) if finding.severity == "error"]
+    """Sentences on axes that the motion contradicts, and on stops that the poses contradict."""
+    return [*(finding.what for finding in Axes().findings(whole) if finding.severity == "error"), *turns_at_stops(whole)]
 
 
 def _warnings(found: ImuMotion, whole: TopicSummary) -> list[str]:

@@ -9,10 +9,14 @@ import numpy as np
 
 from imutool.cleaning.rule import CleaningSettings, TopicSummary
 from imutool.cleaning.rules.units import Units
-from imutool.cleaning.samples import BLOCK, Motion, Samples
-from imutool.cleaning.truth import Truth, truth_of
+from imutool.cleaning.samples import BLOCK, STEP_NS, Motion, Samples
+from imutool.cleaning.truth import Truth, truth_of, turning
+from imutool.inertial.stationary import StationarySettings
 from imutool.log_info.pose_imu_rotation import GyroTurns
 from imutool.recording import Imu, Recording
+
+STOP_STEPS, MIN_STOPS = 50, 4  # of 0.1 s in a piece that may be a stop; pieces that show a turn
+MIN_TURN_RAD_S, SURE = 2e-3, 5.0  # 7 degrees a minute; standard deviations
 
 
 class ImuMotion:
@@ -70,3 +74,28 @@ def in_si_units(recording: Recording) -> tuple[Recording, list[str]]:
     if (whole.scale == 1.0).all():
         return recording, texts
     return replace(recording, imu=Imu(imu.t_ns, imu.gyro * whole.scale[:3], imu.accel * whole.scale[3:])), texts
+
+
+def turns_at_stops(whole: TopicSummary) -> Iterator[str]:
+    """Sentence on a steady turn of the true poses where the samples look like a stop."""
+    if whole.truth is None or len(whole.truth.t_ns) <= STOP_STEPS or not whole.motion.samples:
+        return
+    caps, (step, mean) = StationarySettings(), whole.motion.table()
+    starts, ends, turn = turning(whole.truth, STOP_STEPS)
+    first, last = (np.searchsorted(step * STEP_NS + whole.motion.middle_ns, ns) for ns in (starts, ends))
+    found = []
+    for k in range(0, len(turn), STOP_STEPS):
+        gyro, accel = np.split(mean[first[k] : last[k]] * whole.scale, 2, axis=1)
+        scatter = (
+            [float(np.sqrt(x.var(axis=0).sum())) for x in (gyro, accel)] if abs(len(gyro) - STOP_STEPS) < 3 else [np.inf] * 2
+        )
+        if scatter[0] <= caps.gyro_scatter_rad_s and scatter[1] <= caps.accel_scatter_m_s2:
+            found.append((gyro.mean(axis=0), turn[k]))
+    calmest = min((gyro for gyro, _ in found), key=np.linalg.norm, default=np.zeros(3))
+    turns = [rate for gyro, rate in found if np.linalg.norm(gyro - calmest) <= caps.gyro_agreement_rad_s]
+    if len(turns) < MIN_STOPS or np.linalg.norm(calmest) > caps.gyro_mean_rad_s:
+        return
+    size, std = np.linalg.norm(np.mean(turns, axis=0)), np.linalg.norm(np.std(turns, axis=0, ddof=1)) / np.sqrt(len(turns))
+    if size > max(MIN_TURN_RAD_S, SURE * std):
+        where = "where the samples look like a stop: a bias from stops is off by that"
+        yield f"{whole.truth.topic} turns steadily by {size:.2g} rad/s {where}"

@@ -221,6 +221,7 @@ def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.nd
 
 WITHIN_STAGE = {
     **{"declination": -4, "magnetometer_misalignment": -3, "soft_iron": -2},  # S R m_0 + h: the offset comes behind them
+    "mount_rotation:step": -1,  # ahead of scales, as the mount of the whole log
     **{"gain": -2, "dead_band": -1, "gyro_g_sensitivity": 1, "saturation": 1, "quantization": 2},
     **{"coulomb_friction": 1, "stribeck_friction": 1, "actuator_gain": 2},  # they hold what all else leaves of a command
     **{"actuator_dead_band": 3, "torque_saturation": 3},  # between what the motion needs and the command
@@ -294,5 +295,5 @@ def in_stage_order(acting: Acting) -> list[tuple[Effect, Theta]]:
 
 
 def stage_order(effect: Effect) -> tuple[int, int, str]:
-    """Sorting key of an effect: its stage, then its place within it, then its key."""
-    return effect.stage, WITHIN_STAGE.get(effect.name, int(effect.of_time)), effect.key  # S M omega + G f + b (Rehder 2016)
+    """Sorting key of an effect: stage, place within it, key: S M omega + G f + b (Rehder 2016)."""
+    return effect.stage, WITHIN_STAGE.get(effect.key, WITHIN_STAGE.get(effect.name, int(effect.of_time))), effect.key

@@ -52,7 +52,7 @@ from imutool.errors import ConfigError, ImutoolError, did_you_mean
 from imutool.mcap_io.storage.target import Target
 from imutool.sensor import catalogue, physics_file_terms
 from imutool.sensor.effect import Effect, Theta
-from imutool.sensor.effects import gyro_scale, low_pass
+from imutool.sensor.effects import gyro_scale, low_pass, saturation
 from imutool.sensor.physics_file_terms import DRIVEN, VARIABLES
 from imutool.units import SENSORS, Sensor, Three
 
@@ -138,7 +138,8 @@ class PhysicsFile(Settings, frozen=True, kw_only=True):
                 continue
             place = f"effect[{k}]"
             effect = _driven(entry, where, place) if entry.name == DRIVEN else _named(entry.name, known, where, place)
-            effect = gyro_scale.of_form(low_pass.of_signal(effect, entry.signal), entry.parameters)
+            effect = low_pass.of_signal(saturation.of_form(effect, entry.parameters), entry.signal)
+            effect = gyro_scale.of_form(effect, entry.parameters)
             found.append((effect, _theta(entry, effect, where, place)))
         found += [(_curve(curve, k, where), np.zeros(0)) for k, curve in enumerate(self.unknown)]
         for k, term in enumerate(self.term):

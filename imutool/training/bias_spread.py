@@ -83,7 +83,8 @@ def store_statistics(
     scored, residual = corrected(model, pool)
     rest, std = rest.clone(), torch.zeros_like(rest)
     shown = np.repeat([sensor in pool.sensors for sensor in SENSORS], 3)
-    model.noise_std.copy_(torch.from_numpy(white_noise(torch.cat([pool.gyro, pool.accel], dim=1).cpu().numpy())))
+    samples = torch.cat([pool.gyro, pool.accel], dim=1).cpu().numpy()
+    model.noise_std.copy_(torch.from_numpy(white_noise(samples, 1.0 / pool.rate_hz)))
     for sensor in pool.sensors:
         columns = COLUMNS[sensor]
         solution = closed_form.solve(scored, sensor, residual, rest, window_s[sensor], matrix=False, part="all")

@@ -212,6 +212,14 @@ def test_white_noise_is_found_under_the_motion() -> None:
     assert not white_noise(plain[:10]).any()
 
 
+def test_white_noise_at_25_hz_is_not_the_motion_of_a_hand() -> None:
+    """It was four to twenty times the noise, as were the deviations of debiased messages and the density that `info` gives."""
+    t, sigma = np.arange(1500) / 25.0, 0.0025
+    hand = np.sin(2.0 * np.pi * 1.5 * t)[:, None]
+    noisy = hand + sigma * np.random.default_rng(1).normal(size=(len(t), 3))
+    np.testing.assert_allclose(white_noise(noisy, 1.0 / 25.0), sigma * 5 / 6, rtol=0.15)
+
+
 # ── as samples come ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 

@@ -286,3 +286,16 @@ def test_info_measures_how_the_body_of_the_poses_is_turned(tmp_path: Path, angle
     assert np.allclose(truth.body_turned_deg, turn.as_rotvec(degrees=True), atol=1.0)
     warned = [warning for warning in report.warnings if "the body of the poses" in warning]
     assert len(warned) == (angle_deg > 4.0)
+
+
+@pytest.mark.parametrize(("rate", "verdict"), [(0.0, "fits"), (0.015, "doubtful")])
+def test_a_steady_turn_of_the_true_poses_contradicts_a_bias_from_stops(rate: float, verdict: str) -> None:
+    """On a turntable a constant bias was said to fit, with the whole turn in it."""
+    t_ns, rng = 1_700_000_000_000_000_000 + 10_000_000 * np.arange(3000), np.random.default_rng(1)
+    gyro = np.array([0.004, -0.003, 0.002 + rate]) + 0.003 * rng.normal(size=(3000, 3))
+    imu = Imu(t_ns, gyro, np.array([0.0, 0.0, 9.81]) + 0.03 * rng.normal(size=(3000, 3)))
+    angle = rate * np.arange(300) / 10.0 + 1e-3 * rng.normal(size=300)
+    q_wb = Rotation.from_euler("z", angle[:, None]).as_quat(scalar_first=True)
+    table = Recording("table", imu, {"/ground_truth/pose": Poses(t_ns[::10], np.zeros((300, 3)), q_wb)})
+    fitness = debias_recording(table, model="static").fitness
+    assert (fitness.verdict, "turns steadily by 0.015 rad/s" in fitness.reasons[0]) == (verdict, rate > 0.0)

@@ -191,7 +191,9 @@ def _solved(
     with np.errstate(invalid="ignore"):  # of parts that the motion does not show, whose deviation is infinite
         by_chance = AGREE * np.sqrt(np.maximum(std**2 - std[0] ** 2, 0.0))
     change = np.abs(theta - theta[0])
-    error = np.max(np.where(change > by_chance, change, 0.0)[1:] / (1.0 - square[1:]), axis=0, initial=0.0)
+    stated = np.max(np.where(change > by_chance, change, 0.0)[1:] / (1.0 - square[1:]), axis=0, initial=0.0)
+    # in no slower band more of it is gone than this one tells: a band that is nearly empty may tell anything
+    error = np.minimum(stated, np.min((change + AGREE * std)[1:] / (1.0 - square[1:]), axis=0, initial=np.inf))
     total = np.hypot(std, square * error)
     best = total.argmin(axis=0), np.arange(len(total[0]))
     taken = np.concatenate([theta[0, : p + 3], np.clip(theta[0, p + 3 :], -MAX_SMALL, MAX_SMALL)])

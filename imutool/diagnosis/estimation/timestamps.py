@@ -15,11 +15,12 @@ from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.diagnosis.settings import TimestampSettings
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
-from imutool.sensor.samples import SensorSamples
-from imutool.units import ASCII_UNITS, SENSORS, UNITS, Sensor
+from imutool.sensor.effects import saturation
+from imutool.units import ASCII_UNITS, AXES, SENSORS, UNITS
 
 SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft limit is looked for
 MIN_VALUES, MIN_ROWS = 3, 100  # of a grid
+OWN_LIMIT = 0.1  # of the largest reading of a sensor, that the limit of one axis is at least
 READ, NOISY = 0.999, 6.0  # of the readings are no glitch; deviations of a sample by which noise goes beyond a limit
 FINER = 0.05  # of the noise, that readings differ by right below a limit
 UNEVEN = "stamps jitter, samples do not"
@@ -144,26 +145,37 @@ def grid(x: Float64[np.ndarray, " n"], settings: TimestampSettings = DEFAULT.tim
     return step if float((off < 0.05).mean()) > settings.grid_share else 0.0
 
 
-def limits(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAULT.timestamps) -> dict[Sensor, float]:
-    """Limits of the converters: the largest readings of a side that recur to the last digit."""
-    highest, moves = dict[Sensor, float](), ~stuck(real)  # a dead axis has no limit
+def limits(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAULT.timestamps) -> dict[str, float]:
+    """Limits of the converters: the largest readings of a side that recur to the last digit.
+
+    By sensor; by axis (`gyro_x`) where another axis of the sensor reads more.
+    """
+    highest, moves = dict[str, float](), ~stuck(real)  # a dead axis has no limit
     for k, signal in enumerate(SENSORS):
-        values, at, next_to = real[:, 3 * k : 3 * k + 3][:, moves[3 * k : 3 * k + 3]], 0, 0
-        limit = float(np.abs(values).max(initial=0.0))
-        for side in (values, -values):  # 16 bits end at -32768 and 32767
-            if (end := float(side.max(initial=0.0))) >= settings.clipped_share * limit:
-                below = side[side < end * (1.0 - 1e-9)]
-                at, next_to = at + side.size - below.size, next_to + int((below >= below.max(initial=0.0) * (1.0 - 1e-9)).sum())
-        if at >= settings.min_at_limit and at > settings.piled_factor * next_to:  # on a grid all come again, less at the ends
-            highest[signal] = limit
+        own = [a for a in range(3 * k, 3 * k + 3) if moves[a]]
+        varied = [a for a in own if len(np.unique(real[:, a])) > MIN_ROWS]
+        by_axis = {f"{signal}_{AXES[a % 3]}": _limit(real[:, [a]], settings) for a in varied}
+        common, minimum = _limit(real[:, own], settings), OWN_LIMIT * float(np.abs(real[:, own]).max(initial=0.0))
+        highest |= {signal: common} if common else {key: limit for key, limit in by_axis.items() if limit > minimum}
     return highest
+
+
+def _limit(values: Float64[np.ndarray, "n k"], settings: TimestampSettings) -> float:
+    """Largest reading of some axes if it is a limit, else 0."""
+    at, next_to, limit = 0, 0, float(np.abs(values).max(initial=0.0))
+    for side in (values, -values):  # 16 bits end at -32768 and 32767
+        if (end := float(side.max(initial=0.0))) >= settings.clipped_share * limit:
+            below = side[side < end * (1.0 - 1e-9)]
+            at, next_to = at + side.size - below.size, next_to + int((below >= below.max(initial=0.0) * (1.0 - 1e-9)).sum())
+    # on a grid all come again, less at the ends
+    return limit if at >= settings.min_at_limit and at > settings.piled_factor * next_to else 0.0
 
 
 def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]]) -> tuple[Effect, ...]:
     """Saturation with noise on top, the bias ahead of it or, if a sensor corrects it, behind."""
     candidates = []
     for k, signal in enumerate(SENSORS):
-        if any(signal in limits(pair.real, pair.settings.timestamps) for pair in pairs):
+        if any(key.startswith(signal) for pair in pairs for key in limits(pair.real, pair.settings.timestamps)):
             continue
         part = slice(3 * k, 3 * k + 3)
         bias = np.mean([b[part] for b in biases], axis=0)
@@ -173,30 +185,18 @@ def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]
             lower = max(float(np.max(np.quantile(np.abs(x), READ) - NOISY * white_noise(x))) for x in real)
             L = Parameter(f"{signal}_limit", UNITS[signal], limit, positive=True, null_value=np.inf, step=1e-4, minimum=lower)
             starts, text = starts_at(*([share * limit] for share in SHARES)), f"{signal} = clip({signal}, -L, L)"
-            given = "saturation", Stage.CONVERTER, (signal,), text, (L,), "the limit is reached", _Clip(k, ahead), False, starts
-            candidates.append(Effect(*given, variant=variant))
+            given = "saturation", Stage.CONVERTER, (signal,), text, (L,), "the limit is reached"
+            clip = saturation.BiasedClip(k, ahead)
+            candidates.append(Effect(*given, clip, False, starts, variant=variant))
     return tuple(candidates)
-
-
-class _Clip:
-    """Readings between two limits, the bias being part of what is read."""
-
-    def __init__(self, sensor: int, bias: Float64[np.ndarray, "3"]) -> None:
-        self.sensor, self.bias = sensor, bias
-
-    def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
-        x = read.gyro if self.sensor == 0 else read.accel
-        out = np.clip(x + self.bias, -theta[0], theta[0]) - self.bias
-        return read.with_readings(gyro=out) if self.sensor == 0 else read.with_readings(accel=out)
 
 
 def clipped(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAULT.timestamps) -> Bool[np.ndarray, "n 6"]:
     """Clipped samples of an axis, and their neighbours, which filters mix with them."""
-    at, highest = np.zeros(real.shape, bool), limits(real, settings)
-    for k, signal in enumerate(("gyro", "accel")):
-        if signal in highest:
-            part = slice(3 * k, 3 * k + 3)
-            at[:, part] = np.abs(real[:, part]) >= settings.clipped_share * highest[signal]
+    at = np.zeros(real.shape, bool)
+    for key, limit in limits(real, settings).items():
+        *_, part = saturation.of_limit(key)
+        at[:, part] = np.abs(real[:, part]) >= settings.clipped_share * limit
     return np.asarray(binary_dilation(at, np.ones((5, 1), bool))) if at.any() else at
 
 
@@ -210,11 +210,8 @@ def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "_ 6
     settings, parameters = pairs[0].settings.timestamps, dict[str, Estimate]()
     powers, signal_of, p = [0.0, 0.0, 0.0], "", 1.0
     real, model = (np.concatenate(parts) for parts in ([pair.real for pair in pairs], expected))
-    for k, signal in enumerate(SENSORS):
-        limit = limits(real, settings).get(signal)
-        if limit is None:
-            continue
-        part = slice(3 * k, 3 * k + 3)
+    for key, limit in limits(real, settings).items():
+        name, signal, part = saturation.of_limit(key)
         at = np.abs(real[:, part]) >= limit * (1.0 - settings.limit_error)
         beyond = (model[:, part] * np.sign(real[:, part]))[at] > limit
         below = np.abs(real[:, part])[np.abs(real[:, part]) < limit * (1.0 - 1e-9)].max(initial=0.0)
@@ -222,13 +219,13 @@ def saturated(pairs: Sequence[Pair], expected: Sequence[Float64[np.ndarray, "_ 6
         chance = 0.0 if is_cut else float(binom.sf(beyond.sum() - 1, len(beyond), 0.5)) * tried
         if chance > 1e-2 and beyond.mean() < 0.9:
             continue
-        parameters[f"{signal}_limit"] = Estimate(limit, settings.limit_error * limit, UNITS[signal])
+        parameters[name] = Estimate(limit, settings.limit_error * limit, UNITS[signal])
         before = ((real - model)[:, part] ** 2)[at]
         after = ((real[:, part] - np.clip(model[:, part], -limit, limit)) ** 2)[at]
         powers, signal_of, p = [float(before.sum()), float(after.sum()), float(at.size)], signal, min(p, chance)
     if not parameters:
         return []
-    seen_in = signal_of if len(parameters) == 1 else "both"
+    seen_in = signal_of if all(name.startswith(signal_of) for name in parameters) else "both"
     length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
     before_rms, after_rms = (float(np.sqrt(power / powers[2])) for power in powers[:2])
     held_out = HeldOut(before_rms, after_rms, ASCII_UNITS[signal_of], round(length, 1))

@@ -31,6 +31,7 @@ from imutool.inertial.stationary import white_noise
 from imutool.recording import Recording, seconds
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect
+from imutool.sensor.effects import saturation
 from imutool.sensor.samples import IdealMotion
 from imutool.sensor.simulate import MOTION_TOPIC
 from imutool.sensor.trajectory import Stretch, smooth_motion
@@ -257,10 +258,11 @@ def _limits(pair: Pair) -> list[Finding]:
     limits = timestamps.limits(pair.real, pair.settings.timestamps)
     if not limits:
         return []
-    parameters = {f"{signal}_limit": Estimate(value, 0.0, UNITS[signal]) for signal, value in limits.items()}
-    length = round(float(pair.stamp_s[-1] - pair.stamp_s[0]), 1)
-    signal = next(iter(limits)) if len(limits) == 1 else "both"
-    held_out = HeldOut(0.0, 0.0, "-", length)
+    found = [(*saturation.of_limit(key)[:2], value) for key, value in limits.items()]
+    parameters = {name: Estimate(value, 0.0, UNITS[signal]) for name, signal, value in found}
+    signals = {signal for _, signal, _ in found}
+    signal = signals.pop() if len(signals) == 1 else "both"
+    held_out = HeldOut(0.0, 0.0, "-", round(float(pair.stamp_s[-1] - pair.stamp_s[0]), 1))
     return [Finding("saturation", signal, 0.0, 0.0, 0.0, parameters, "readings pile up at +-limit", held_out)]
 
 
@@ -277,18 +279,14 @@ def locate_stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) 
 
 def unusable_axes(pair: Pair) -> list[str]:
     """Unusable axes of a log, with the reason."""
-    stuck, clipped, saturated, out = (
-        timestamps.stuck(pair.real),
-        timestamps.clipped(pair.real, pair.settings.timestamps).mean(axis=0),
-        at_limit(pair),
-        [],
-    )
+    clipped = timestamps.clipped(pair.real, pair.settings.timestamps).mean(axis=0)
+    stuck, saturated, out = timestamps.stuck(pair.real), at_limit(pair), []
     for a in np.flatnonzero(stuck & ~saturated):
         signal = SENSORS[a // 3]
         out.append(f"{signal} {AXES[a % 3]} reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample")
-    for signal, maximum in timestamps.limits(pair.real, pair.settings.timestamps).items():
-        k = 3 * SENSORS.index(signal)
-        share = ", ".join(f"{AXES[a - k]} in {percent(float(clipped[a]))}" for a in range(k, k + 3) if saturated[a])
+    for key, maximum in timestamps.limits(pair.real, pair.settings.timestamps).items():
+        _, signal, part = saturation.of_limit(key)
+        share = ", ".join(f"{AXES[a % 3]} in {percent(float(clipped[a]))}" for a in range(6)[part] if saturated[a])
         if share:
             out.append(f"{signal} is at its limit of {maximum:.4g} {UNITS[signal]}: {share} of the samples")
     return out

@@ -172,7 +172,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "vibration_rectification": "{w.it} turns vibration into a constant, with {w.main}",
     "lever_arm": "{w.it} sits {w.main} from the tracked point",
     "size_effect": "its three axes sit apart, by {w.main}",
-    "mount_rotation": "{w.it} is mounted turned by {w.main}",
+    "mount_rotation": lambda w: f"{w.it} is mounted turned by {w.main}{f' from {w.rest[0]} on' if w.rest else ''}",
     "clock_offset": _clock_offset,
     "clock_skew": _clock_skew,
     "clock_jump": _clock_jump,

@@ -85,8 +85,7 @@ def likeliest_onset(
     are sums from that time on.
     """
     columns = np.ones((len(t_s), 1)) if setting_in is None else setting_in
-    left, singular, _ = np.linalg.svd(beside / np.maximum(np.linalg.norm(beside, axis=0), 1e-300), full_matrices=False)
-    basis = left[:, singular > INDEPENDENT * singular[0]]
+    basis = orthonormal(beside)
     size, row = _largest(t_s, error, basis, columns)
     for _ in range(before):
         step = (np.arange(len(t_s)) > row).astype(np.float64)
@@ -94,6 +93,12 @@ def likeliest_onset(
         basis = np.column_stack([basis, step / np.linalg.norm(step)])
         size, row = _largest(t_s, error, basis, columns)
     return np.append(size, (t_s[row] + t_s[row + 1]) / 2.0)
+
+
+def orthonormal(beside: Float64[np.ndarray, "n q"]) -> Float64[np.ndarray, "n r"]:
+    """Orthonormal basis of some columns."""
+    left, singular, _ = np.linalg.svd(beside / np.maximum(np.linalg.norm(beside, axis=0), 1e-300), full_matrices=False)
+    return np.asarray(left[:, singular > INDEPENDENT * singular[0]])
 
 
 def _largest(
@@ -104,16 +109,21 @@ def _largest(
 ) -> tuple[Float64[np.ndarray, "3"], int]:
     """Size of what explains most by setting in, after orthonormal columns, and the sample before it."""
     rest = error - basis @ (basis.T @ error)
-    own = [_from_on(x**2) - (_from_on(basis * x[:, None]) ** 2).sum(axis=1) for x in columns.T]
+    own = [from_on(x**2) - (from_on(basis * x[:, None]) ** 2).sum(axis=1) for x in columns.T]
     minimum = np.maximum((columns**2).mean(axis=0), np.finfo(np.float64).tiny)
-    sums = _from_on(rest * columns)
+    sums = from_on(rest * columns)
     size = sums / np.maximum(np.stack(own, axis=1), minimum)
     gain = (sums * size / np.maximum((rest**2).mean(axis=0), np.finfo(np.float64).tiny)).sum(axis=1)
-    row = int(np.argmax(np.where((t_s[1:] > t_s[0] + EDGE_S) & (t_s[:-1] < t_s[-1] - EDGE_S), gain, 0.0)))
+    row = best_row(t_s, gain)
     return size[row], row
 
 
-def _from_on(x: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "n-1 ..."]:
+def best_row(t_s: Float64[np.ndarray, " n"], gain: Float64[np.ndarray, " _"]) -> int:
+    """The sample before the onset that gains most, but for the ends of the log."""
+    return int(np.argmax(np.where((t_s[1:] > t_s[0] + EDGE_S) & (t_s[:-1] < t_s[-1] - EDGE_S), gain, 0.0)))
+
+
+def from_on(x: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "n-1 ..."]:
     """Sums of the samples behind each but the last."""
     return np.asarray(np.cumsum(x[::-1], axis=0)[::-1][1:])
 

@@ -1,4 +1,4 @@
-"""Scale error of the gyro: omega (1 + s), per axis; with `t_step` from one time on."""
+"""Scale error of the gyro: omega (1 + s), per axis; with `t_step` from one time on, as a mount that slips."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis, residual
+from imutool.sensor.effects import mount_rotation
 from imutool.sensor.effects.gyro_bias_step import followed, likeliest_onset
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import SENSORS, Sensor
 
-STEP = "step"  # variant of a scale that sets in at one time, also together with the scale of the whole log
+STEP = "step"  # variant of a scale or mount that sets in at one time, also next to that of the whole log
 T_STEP = Parameter("t_step", "s", 30.0, begins=True)
 
 
@@ -27,20 +28,22 @@ def scale(sensor: Sensor, symbol: str, plausible: float, observable_if: str) -> 
 
 
 def of_form(effect: Effect, names: Container[str]) -> Effect:
-    """A scale from one time on if `t_step` is among the names, any other effect itself."""
-    return _from_one_time_on(effect) if effect.name in SCALES and T_STEP.name in names else effect
+    """A scale or mount from one time on if `t_step` is among the names, any other effect itself."""
+    return _from_one_time_on(effect) if effect.name in SETTING_IN and T_STEP.name in names else effect
 
 
 def in_both_forms(effects: Sequence[Effect]) -> Iterator[Effect]:
-    """Effects, and behind each scale one that sets in at one time."""
+    """Effects, and behind each scale and mount one that sets in at one time."""
     for effect in effects:
         yield effect
-        if effect.name in SCALES:
+        if effect.name in SETTING_IN:
             yield _from_one_time_on(effect)
 
 
 def _from_one_time_on(whole: Effect) -> Effect:
-    """The scale error of a sensor that sets in: s, then the time (s from the log's start)."""
+    """A scale error that sets in, or a mount that slips: its size, then the time (s from the log's start)."""
+    if whole.name == mount_rotation.EFFECT.name:
+        return replace(mount_rotation.slipping(T_STEP), variant=STEP)
     sensor: Sensor = "gyro" if whole.sensors == ("gyro",) else "accel"
 
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
@@ -68,4 +71,5 @@ def _from_one_time_on(whole: Effect) -> Effect:
 
 
 SCALES = ("gyro_scale", "accel_scale")
+SETTING_IN = (*SCALES, mount_rotation.EFFECT.name)
 EFFECT = scale("gyro", "omega", 0.1, "the axis turns")

@@ -1,4 +1,4 @@
-"""Rotation of the mount: the axes of both sensors against the body's."""
+"""Rotation of the mount: the axes of both sensors against the body's; it may slip."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, residual
+from imutool.sensor.effects.gyro_bias_step import best_row, followed, from_on, orthonormal
 from imutool.sensor.samples import IdealMotion, SensorSamples, Vectors
 
 NOTHING_MOVES = 1e-9  # rad/s or m/s², below which a sensor says nothing
@@ -43,6 +44,43 @@ def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     turned = Rotation.from_matrix(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
     squares, before = (float(((body - vectors) ** 2).sum()) for vectors in (turned.apply(sensor), sensor))
     return [np.zeros(3), *([turned.as_rotvec()] if turned.magnitude() > NEAR_RAD and squares < MAX * before else [])]
+
+
+def slipping(at: Parameter) -> Effect:
+    """The rotation of a mount that slips at one time, which is its last parameter."""
+    return replace(
+        EFFECT,
+        stage=Stage.SENSOR,  # between samples, a motion that turns at once has no spline
+        equation=f"{EFFECT.equation} from {at.name} on",
+        parameters=(*EFFECT.parameters, at),
+        forward=_slipped,
+        starts=_slips,
+        alternatives=lambda samples: len(samples.stamp_s),
+    )
+
+
+def _slipped(samples: SensorSamples, theta: Theta) -> SensorSamples:
+    R_bi, on = _rotation(*theta[:3].tolist()), np.asarray(samples.stamp_s >= theta[3])[:, None]
+    return samples.with_readings(*(np.where(on, _turned(x, R_bi), x) for x in (samples.gyro, samples.accel)))
+
+
+def _slips(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
+    """The likeliest slip of a mount, by which v changes to v + v x phi."""
+    t_s = samples.stamp_s
+    ideal = motion.sample(t_s, t_s)
+    basis = orthonormal(np.column_stack([np.ones(len(t_s)), followed(ideal)]))
+    N, g = np.zeros((len(t_s) - 1, 3, 3)) + np.diag([p.plausible**-2 for p in EFFECT.parameters]), np.zeros((len(t_s) - 1, 3))
+    for v, error in zip((ideal.gyro, ideal.accel), residual(motion, samples), strict=True):
+        by_phi = np.stack([np.cross(v, axis) for axis in np.eye(3)], axis=2)
+        rest = error - basis @ (basis.T @ error)
+        for columns, own in zip(by_phi.transpose(1, 0, 2), rest.T, strict=True):
+            weight = 1.0 / max(float((own**2).mean()), np.finfo(np.float64).tiny)
+            shared = np.stack([from_on(basis * x[:, None]) for x in columns.T], axis=1)
+            N += weight * (from_on(columns[:, :, None] * columns[:, None]) - shared @ shared.transpose(0, 2, 1))
+            g += weight * from_on(columns * own[:, None])
+    phi = np.linalg.solve(N, g[..., None])[..., 0]
+    row = best_row(t_s, (phi * g).sum(axis=1))
+    return [np.append(phi[row], (t_s[row] + t_s[row + 1]) / 2.0)]
 
 
 EFFECT = Effect(

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from support.benchmarks import benchmark
 
 from imutool.config import build
-from imutool.diagnosis.audit import audit, lines, simulator_faults
+from imutool.diagnosis.audit import audit, lines, motion, simulator_faults
 from imutool.diagnosis.audit.axes import Matrix
 from imutool.diagnosis.audit.bandwidth import max_filter_delay
 from imutool.diagnosis.audit.motion import kinematic_fit, kinematics
@@ -255,3 +255,12 @@ def test_digits_of_a_slow_motion_repeat_no_samples() -> None:
     x = 5e-3 * np.round(slow / 5e-3)
     imu = Imu((t * 1e9).astype(np.int64), np.ascontiguousarray(x[:, :3]), np.ascontiguousarray(x[:, 3:]))
     assert noise_faults(imu, x - slow, []) == ([], [])
+
+
+def test_a_band_that_holds_next_to_nothing_contradicts_no_two_that_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a quadruped that trots the slowest held one line, and told 8.6 ms of the acceleration: stamps were called early."""
+    k = kinematics(bench.made("null", 5, DURATION_S)[0])
+    bands = iter([(-2e-4, 1e-4), (0.0, 4e-5), (-8.6e-3, 8e-4)])
+    monkeypatch.setattr(motion, "_in_band", lambda *_: tuple(np.full(4, value) for value in next(bands)))
+    (tau,), (std,), _ = motion._solved(k, k.accel, k.j_w[:, :, None], np.zeros(1), np.zeros((len(k.t_s), 3, 0)))
+    assert abs(tau) < 3.0 * std < 1e-3

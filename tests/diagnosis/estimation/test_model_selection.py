@@ -173,6 +173,24 @@ def test_a_scale_that_sets_in_is_that_scale_with_its_time(sensor: str, scale: li
     assert (np.abs(one.theta - [*scale, 13.3]) < SURE * one.std).all()
 
 
+def test_a_mount_that_slips_is_that_rotation_with_its_time() -> None:
+    """It was a step of the accelerometer's bias; beside poses it was half of the rotation, throughout."""
+    motion, phi = planted.rich(), [0.02, -0.03, 0.04]
+    slips = planted.ideal(motion, planted.acting({"mount_rotation": phi})) - planted.ideal(motion)
+    pair = planted.pair(motion, {}, 3, added=slips * (motion.t_s >= 13.3)[:, None])
+    (one,) = select_effects([planted.weighed(pair)], tuple(gyro_scale.in_both_forms(planted.catalogue()))).selected
+    assert (one.effect.name, one.effect.parameters[-1].name) == ("mount_rotation", "t_step")
+    assert (np.abs(one.theta - [*phi, 13.3]) < SURE * one.std).all()
+
+
+def test_a_gyro_that_becomes_late_is_no_jump_of_the_clock() -> None:
+    """The clock was said to jump; behind the jump the accelerometer was thirty times farther off than without."""
+    motion = planted.rich()
+    late = planted.ideal(motion, planted.acting({"clock_offset": [-0.015]})) - planted.ideal(motion)
+    from_half_on = np.outer(motion.t_s >= 13.3, [1.0] * 3 + [0.0] * 3)
+    assert "clock_jump" not in names(asked(planted.pair(motion, {}, 3, added=late * from_half_on)))
+
+
 def several_times(pair: Pair) -> Selection:
     """The catalogue, with what may act more than once."""
     forms = gyro_bias_step.repeated([*gyro_bias_drift.within(planted.catalogue(), float(pair.stamp_s[-1]))])

@@ -13,6 +13,7 @@ from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.observability import beyond_the_band
 from imutool.diagnosis.settings import SearchSettings
+from imutool.sensor.physics_file import Entry, PhysicsFile, Value
 
 N = 2400
 SURE = 4.0
@@ -206,6 +207,24 @@ def test_the_limits_of_a_converter_are_not_alike_on_both_sides(sign: float) -> N
     assert timestamps.limits(clipped.real) == {"gyro": 32768 * lsb}
     (found,) = timestamps.saturated([clipped], [one.real], 50)
     assert found.held_out.rms_after < 0.1 * found.held_out.rms_before
+
+
+def test_one_axis_may_have_a_limit_of_its_own() -> None:
+    """The other axes read more, so that there was no limit: a curve without a name was said to be missing."""
+    one = planted.pair(planted.rich())
+    limit, real = float(np.quantile(np.abs(one.real[:, 1]), 0.9)), one.real.copy()
+    real[:, 1] = np.clip(real[:, 1], -limit, limit)
+    assert np.abs(real[:, :3]).max() > limit
+    assert timestamps.limits(real) == {"gyro_y": limit}
+    clipped = timestamps.clipped(real)
+    assert clipped[np.abs(one.real[:, 1]) >= limit, 1].all()
+    assert not clipped[:, [0, 2, 3, 4, 5]].any()
+    (found,) = timestamps.saturated([replace(one, real=real)], [one.real], 50)
+    assert (found.signal, list(found.parameters)) == ("gyro", ["gyro_limit_y"])
+    entry = Entry(name="saturation", parameters={"gyro_limit_y": Value(value=limit, unit="rad/s")})
+    ((effect, theta),) = PhysicsFile(effect=(entry,)).acting()
+    again = planted.ideal(planted.rich(), ((effect, theta),))
+    assert np.abs(again[:, 1]).max() == limit < np.abs(again[:, [0, 2]]).max()
 
 
 def test_a_dead_axis_has_no_limit() -> None:

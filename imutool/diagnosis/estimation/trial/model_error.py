@@ -18,7 +18,7 @@ from imutool.diagnosis.estimation.observability import LOW_PASSES, STEADY, WANDE
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.effect import Effect, Theta
-from imutool.sensor.effects.gyro_bias_step import INDEPENDENT, followed
+from imutool.sensor.effects.gyro_bias_step import followed, orthonormal
 
 CLOCKS = (*STEADY, WANDER)
 FILTERS = (*LOW_PASSES, "mount_resonance", "gyro_delay", "gyro_hysteresis", "accel_hysteresis")
@@ -127,8 +127,7 @@ def _local_p_value(pair: Pair, effect: Effect, others: Chosen, chosen: Chosen) -
     free = len(beside) - beside.shape[1] - 1
     if free < beside.shape[1] or not 0 < int((near[rows] > 0).sum()) < len(beside):
         return 1.0
-    left, singular, _ = np.linalg.svd(beside / np.maximum(np.linalg.norm(beside, axis=0), 1e-300), full_matrices=False)
-    basis = left[:, singular > INDEPENDENT * singular[0]]
+    basis = orthonormal(beside)
     rest, step = (pair.real - without)[rows, part], (np.arange(len(near)) > at)[rows, None].astype(np.float64)
     rest, step = (x - basis @ (basis.T @ x) for x in (rest, step))
     gain = (step * rest).sum(axis=0) ** 2 / (step**2).sum()

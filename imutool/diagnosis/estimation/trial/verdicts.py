@@ -163,6 +163,7 @@ class Trial:
         below |= {e.effect.key for e in verdicts if self._may_be_error(e.effect, whole)}
         below |= {e.effect.key for e in verdicts if below_reference_error(e.effect, e.gain, whole)}
         below |= {e.effect.key for e in verdicts if exact and is_part_of_misfit(e.effect, e.gain, whole)}
+        below |= {e.effect.key for e in verdicts if self._is_contradicted(e.effect, whole)}
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in below else verdict for verdict in verdicts]
 
     def _shown_elsewhere(self, key: str, gains: Mapping[str, float], whole: Fit) -> bool:
@@ -175,6 +176,17 @@ class Trial:
         others = tuple(entry for entry in whole.chosen if entry[0] is not effect)
         gained = axis_squares(fit(whole.logs, others, part=whole.part, near=whole)) - axis_squares(whole)
         return self.candidates.log_p(effect, float(sum(gained[part].sum() for part in columns))) < self.threshold
+
+    def _is_contradicted(self, effect: Effect, whole: Fit) -> bool:
+        """Whether an effect of several sensors leaves clearly more of one: it is none of them all."""
+        parts = [part for name, part in whole.logs[0].pair.signals.items() if name in effect.sensors]
+        if len(parts) < 2:
+            return False
+        others = tuple(entry for entry in whole.chosen if entry[0] is not effect)
+        gained = axis_squares(fit(whole.logs, others, part=whole.part, near=whole)) - axis_squares(whole)
+        each = [float(gained[part].sum()) for part in parts]
+        lost = -min(each)
+        return lost > self.settings.contradicted_share * max(each) and self.candidates.log_p(effect, lost) < self.threshold
 
     def _may_be_error(self, effect: Effect, whole: Fit) -> bool:
         """Whether an effect of a fit may be the error of its low-pass."""
