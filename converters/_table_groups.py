@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import chain
 
 from ._table_geodetic import in_their_world
-from ._table_map import IMU_TOPIC, POSE_GROUPS, Entries, column_named
+from ._table_map import IMU_TOPIC, POSE_GROUPS, POSES_GROUP, Entries, column_named
 from ._table_names import ESTIMATED, TIME_WORDS, group_of, leaf_of, name_and_unit, spaced_name, split_name, triples
 from ._table_pose_names import (
     NED,
@@ -78,9 +78,9 @@ def _paired(gyros: Mapping[str, Axes], accels: Mapping[str, Axes]) -> dict[str, 
 def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Entries:
     """Entries for an accelerometer with a time of its own, and for poses on any time.
 
-    Of several groups with poses true ones come first. None are taken whose quaternions have no certain order, and none of
-    the IMU's own group without positions: an orientation alone is one that the sensor itself estimates, unless it is named as
-    that of a motion capture.
+    Of several groups with poses true ones come first, and then a table of poses. None are taken whose quaternions have no
+    certain order, and none of the IMU's own group without positions: an orientation alone is one that the sensor itself
+    estimates, unless it is named as that of a motion capture.
     """
     time, unit = str(entries["time"]), str(entries["time_unit"])
     other = time_beside(columns, columns.unsigned(entries["accel"][0]), time, unit, separate=True)
@@ -100,7 +100,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
             poses.append((not named_true, clock, turns, position))
         elif clock[0] != time or named_true or bodies:
             reasons += _why_no_turns(columns, leaves, bodies, _said_apart(columns, clock, (time, unit)))
-    for is_estimate, clock, turns, named in sorted(poses, key=lambda each: (each[0], each[1]))[:1]:
+    for is_estimate, clock, turns, named in sorted(poses, key=lambda p: (p[0], group_of(p[1][0]) != POSES_GROUP, p[1]))[:1]:
         found |= {"truth_time": clock[0], "truth_time_unit": clock[1], **turns}
         found["pose_kind"] = "estimate" if is_estimate else "truth"
         position, why = in_their_world(columns, {**entries, **turns}, named, clock)

@@ -29,28 +29,36 @@ def load_hdf5(path: Path, columns: Columns) -> None:
     """Add the columns of an HDF5 file.
 
     Raises:
-        DataError: too large, or it holds MATLAB objects, or leads to other files.
+        DataError: too large, or it holds nothing but MATLAB objects or links to other files.
     """
     h5py = required("h5py", "tables", where=path, user="reading it")
     elsewhere: list[str] = []
+    objects: list[str] = []
 
     def look(name: str, link: Any) -> None:  # external links are never followed
         if isinstance(link, h5py.ExternalLink):
             elsewhere.append(name)
 
     def visit(name: str, node: Any) -> None:
-        if not name.startswith("#"):
+        if name.startswith("#"):
+            return
+        if "MATLAB_object_decode" in node.attrs:
+            objects.append(f"{name} is a MATLAB object ({_plain(node.attrs.get('MATLAB_class', 'unknown'))}), not an array")
+        else:
             _add_node(columns, name, node, path)
 
     with h5py.File(path, "r") as file:
         visit("", file)
         file.visititems(visit)
         file.visititems_links(look)
-    if elsewhere:
-        what = f"{', '.join(elsewhere)}: links to other files, which are not followed"
-        if not columns.values:
-            raise DataError(what, where=path, fix="Copy the arrays into this file")
-        columns.remarks.losses.append(what)
+    of_links = f"{', '.join(elsewhere)}: links to other files, which are not followed"
+    for found, what, fix in (
+        (elsewhere, of_links, "Copy the arrays into this file"),
+        (objects, "; ".join(objects), "Save it from MATLAB as arrays, or with writetable as CSV"),
+    ):
+        if found and not columns.values:
+            raise DataError(what, where=path, fix=fix)
+        columns.remarks.losses.extend([f"{what}. {fix}"] if found else [])
 
 
 def names_of_hdf5(path: Path) -> list[str]:
@@ -73,9 +81,6 @@ def _add_node(columns: Columns, name: str, node: Any, path: Path) -> None:
     for key, value in node.attrs.items():
         if np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf":
             columns.add(f"{name}/{key}", value)
-    if "MATLAB_object_decode" in node.attrs:
-        what = f"{name} is a MATLAB object ({_plain(node.attrs.get('MATLAB_class', 'unknown'))}), not an array"
-        raise DataError(what, where=path, fix="Save it from MATLAB as arrays, or with writetable as CSV")
     if not hasattr(node, "dtype") or node.dtype.kind not in "iufbOSV":
         return
     if node.external or node.is_virtual:

@@ -335,6 +335,14 @@ def test_what_a_table_file_cannot_give_is_said_with_what_to_do(convert, tmp_path
     with h5py.File(tmp_path / "object.mat", "w") as file:
         file["T"] = np.arange(3)
         file["T"].attrs.update(MATLAB_class=np.bytes_("timetable"), MATLAB_object_decode=3)
+    with h5py.File(tmp_path / "text.mat", "w") as file:
+        file["names"] = np.arange(6)
+        file["names"].attrs.update(MATLAB_class=np.bytes_("string"), MATLAB_object_decode=3)
+        file["t"], file["gyro"], file["accel"] = 0.01 * np.arange(COUNT), GYRO.T, ACCEL.T
+    done = convert(tmp_path / "text.mat", tmp_path / "text.mcap", "--map", "gyro_unit=rad/s")
+    assert "names is a MATLAB object (string), not an array" in done.stderr
+    assert done.returncode == 3
+    assert (tmp_path / "text.mcap").exists(), "the arrays beside it are read"
     with h5py.File(tmp_path / "links.h5", "w") as file:
         file["gyro"] = h5py.ExternalLink("other.h5", "gyro")
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w") as archive, archive.open("gyro.npy", "w") as member:

@@ -151,6 +151,16 @@ def test_the_imu_keeps_its_own_clock_beside_a_truth_of_as_many_rows(tmp_path):
     assert log.poses["/ground_truth/pose"].t_ns[0] == (EPOCH_S + 3) * 10**9
 
 
+def test_a_table_of_poses_is_taken_before_what_the_imus_table_estimates(tmp_path):
+    own = np.column_stack([P_M + 5.0, XYZW])
+    names, *lines = imu_text().splitlines()
+    beside = [f"{line},{','.join(map(repr, row))}" for line, row in zip(lines, own.tolist(), strict=True)]
+    (tmp_path / "imu.csv").write_text("\n".join([names + ",x,y,z,qx,qy,qz,qw", *beside]) + "\n")
+    (tmp_path / "estPose.csv").write_text("time,px,py,pz,qx,qy,qz,qw\n" + rows(T_S[::2], P_M[::2], XYZW[::2]))
+    (poses,) = read(tmp_path).poses.values()
+    np.testing.assert_allclose(poses.p_wb, P_M[::2], atol=1e-6)
+
+
 def test_a_truth_without_a_time_has_that_of_the_rate_that_it_states(tmp_path):
     columns = imu_text().splitlines()
     imu = "\n".join(line.split(",", 1)[1] for line in columns)
