@@ -158,6 +158,8 @@ def converted(value: Any, where: str, *, times: bool = False) -> Shaped[np.ndarr
         fix = "Convert seconds with np.round(1e9 * seconds).astype(np.int64)"
     elif times and array.dtype == object and getattr(array.flat[0], "tzinfo", None) is not None:
         fix = "Take the time zone off: `column.dt.tz_convert(None)`"
+    elif times and array.ndim == 1 and array.dtype.kind in "OU":
+        fix = "Convert texts and datetimes with np.asarray(times, 'datetime64[ns]')"
     what = f"{where} is {kind}{' with masked values' * masked}"
     raise DataError(what, expected=f"{wanted}[n{'' if times else ', ...'}]", fix=fix)
 
