@@ -181,6 +181,13 @@ def test_poses_keep_their_kind_whatever_their_topic_is_called(tmp_path: Path, ot
     assert dict(imutool.read(tmp_path / "a.mcap").other_poses) == other_poses
 
 
+def test_the_first_truth_stays_the_first(tmp_path: Path) -> None:
+    made = imutool.example_recording(3, duration_s=2.0)
+    recording = replace(made, truths={"/pose": made.truth, "/vicon/pose": made.truth.rows(slice(9))})
+    imutool.write(tmp_path / "a.mcap", recording)
+    assert list(imutool.read(tmp_path / "a.mcap").truths) == ["/pose", "/vicon/pose"]
+
+
 def test_a_recording_is_debiased_as_its_log_is(tmp_path: Path, logs: Path) -> None:
     source, model = logs / "flight_2.mcap", logs / "linear.safetensors"
     from_arrays = imutool.debias(imutool.read(source), imutool.load_model(model))

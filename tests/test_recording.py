@@ -130,6 +130,7 @@ def unchecked(kind: type, *columns: Any) -> Any:
         (Imu, (np.array(["3026", "3027", "3028", "3029"], "datetime64[s]"), V, V), r"Imu.t_ns is datetime64\[s\]"),
         (Imu, (T, np.full((4, 3), 2**53 + 1), V), r"Imu.gyro is int64\[4, 3\]; expected float64"),
         (Imu, ([datetime.fromtimestamp(k, UTC) for k in range(4)], V, V), r"of type list; .* the time zone off"),
+        (Imu, ([datetime.fromtimestamp(k) for k in range(4)], V, V), r"of type list; .* np.asarray"),
         (Imu, (T, torch.zeros(4, 3, requires_grad=True), V), r"Imu.gyro is of type Tensor; .* Use tensor.detach"),
         (Recording, ("r", make_imu(), {1: Poses(T, V, Q)}), "Recording.truths holds a name of type int; expected str"),
         (Poses, (T, V, Q[:, :3]), r"expected float64\[4, 4\]"),

@@ -135,7 +135,7 @@ def check_start_poses(recording: Recording) -> float:
     return delay.seconds if delay is not None and clear else 0.0
 
 
-def check_poses(recording: Recording, *, world: bool = True) -> None:
+def check_poses(recording: Recording, *, world: bool = True, warn: bool = True) -> None:
     """Refuse poses whose quaternions, unit or, with `world`, vertical the IMU contradicts.
 
     Raises:
@@ -148,7 +148,7 @@ def check_poses(recording: Recording, *, world: bool = True) -> None:
         if "poses" in finding.values and (world or whole.quaternions or whole.position_unit != "m"):
             expected = "quaternions as w, x, y, z from body to world, z up, and metres"
             raise DataError(finding.what, where=recording.name, expected=expected, fix=_correction(finding.what, truth))
-    for warning in _warnings(motion, whole):
+    for warning in _warnings(motion, whole) if warn else ():
         logger.warning("%s: %s", recording.name, warning)
 
 

@@ -94,12 +94,12 @@ def _imu(log: LogWriter, recording: Recording) -> list[Series]:
 
 def _poses(log: LogWriter, recording: Recording) -> list[Series]:
     """Every truth as PoseStamped with its velocity, and the first also on /tf."""
-    found: list[Series] = []
+    found, named = list[Series](), {topic: named_kind(topic, schemas.POSE) for topic in recording.truths}
     for which, (topic, poses) in enumerate(recording.truths.items()):
         t_ns, columns = poses.t_ns, (poses.t_ns, poses.p_wb, poses.q_wb_wxyz)
-        kind, named = recording.kind_of(topic), named_kind(topic, schemas.POSE)
-        doubtful = kind != named and not {kind, named}.isdisjoint(DOUBTFUL)  # by its name it would be read as another kind
-        channel = log.channel(topic, schemas.POSE, {KIND_KEY: kind} if doubtful else {})
+        kind, name = recording.kind_of(topic), named[topic]
+        misread = kind != name and ("truth" in named.values() or not {kind, name}.isdisjoint(DOUBTFUL))  # or in another order
+        channel = log.channel(topic, schemas.POSE, {KIND_KEY: kind} if misread else {})
         found.append(Series(channel, t_ns, columns, partial(encode_pose, frame_id=WORLD)))
         if which == 0:
             encode = partial(encode_transform, frame_id=WORLD, child_frame_id=BODY)

@@ -134,8 +134,7 @@ def _same(a: object, b: object) -> bool:
 def converted(value: Any, where: str, *, times: bool = False) -> Shaped[np.ndarray, "..."]:
     """Array of float64, or of int64 nanoseconds for `times`, if the value converts without loss.
 
-    A list, a table's column, numbers as objects, float32, another byte order, smaller integers, and for times `datetime64` and
-    `timedelta64`.
+    A list, a column, objects, float32, another byte order, smaller integers; times also as `datetime64` and `timedelta64`.
 
     Raises:
         DataError: it does not: seconds as float, masked values, text, larger integers, or nothing.
@@ -149,8 +148,7 @@ def converted(value: Any, where: str, *, times: bool = False) -> Shaped[np.ndarr
         array, fix = np.asarray(None), str(error).rstrip(".")
     if array.dtype == object and all(isinstance(item, Real) for item in array.flat):
         array = np.asarray(array.tolist())
-    mask = getattr(value, "mask", None)
-    masked = isinstance(mask, np.ndarray | np.bool_) and bool(mask.any())
+    masked = isinstance(mask := getattr(value, "mask", None), np.ndarray | np.bool_) and bool(mask.any())
     if not masked and (found := _exactly(array, wanted)) is not None:
         return found
     kind = f"{array.dtype}{list(array.shape)}" if isinstance(value, np.ndarray) else f"of type {type(value).__name__}"
@@ -158,8 +156,10 @@ def converted(value: Any, where: str, *, times: bool = False) -> Shaped[np.ndarr
         fix = "Convert seconds with np.round(1e9 * seconds).astype(np.int64)"
     elif times and array.dtype == object and getattr(array.flat[0], "tzinfo", None) is not None:
         fix = "Take the time zone off: `column.dt.tz_convert(None)`"
-    what = f"{where} is {kind}{' with masked values' * masked}"
-    raise DataError(what, expected=f"{wanted}[n{'' if times else ', ...'}]", fix=fix)
+    elif times and array.ndim == 1 and array.dtype.kind in "OU":
+        fix = "Convert texts and datetimes with np.asarray(times, 'datetime64[ns]')"
+    what, expected = f"{where} is {kind}{' with masked values' * masked}", f"{wanted}[n{'' if times else ', ...'}]"
+    raise DataError(what, expected=expected, fix=fix)
 
 
 def _exactly(array: Shaped[np.ndarray, "..."], wanted: np.dtype[Any]) -> Shaped[np.ndarray, "..."] | None:

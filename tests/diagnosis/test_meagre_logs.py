@@ -216,6 +216,19 @@ def test_poses_too_slow_to_be_differentiated_leave_what_samples_show_by_themselv
     assert json_values(d.report)["bias"] == {"gyro": None, "accel": None}
 
 
+@pytest.mark.parametrize(
+    ("factors", "said"), [((1.0, [1, -1, -1, -1]), "are the inverse"), ((1e3, [1, 1, 1, 1]), "are in mm and not in m")]
+)
+def test_poses_that_are_misread_are_no_reference(factors: tuple[float, list[int]], said: str, tmp_path: Path) -> None:
+    """They gave a mount of 49 degrees, and a misfit of 3700 m/s² without a name."""
+    made = example_recording(duration_s=40.0)
+    poses = Poses(made.truth.t_ns, factors[0] * made.truth.p_wb, made.truth.q_wb_wxyz * factors[1])
+    write(replace(made, truths={"/ground_truth/pose": poses}, scalars={}), tmp_path / "real.mcap")
+    found = diagnose([tmp_path / "real.mcap"]).report
+    assert (len(found.findings), len(found.remarks)) == (0, 1)
+    assert said in found.remarks[0]
+
+
 @pytest.mark.parametrize("amplitude", [0.0, 0.05])
 def test_a_vibration_faster_than_the_poses_know_the_motion_is_named(tmp_path: Path, amplitude: float) -> None:
     line = {"vibration": [31.7, amplitude, 0.0, 0.0, -amplitude, *[0.0] * 8]}

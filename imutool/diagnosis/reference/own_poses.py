@@ -26,6 +26,7 @@ from imutool.diagnosis.estimation.time_alignment import with_truth
 from imutool.diagnosis.settings import DiagnoseSettings, ReferenceSettings
 from imutool.errors import DataError
 from imutool.geometry import quaternion
+from imutool.log_info.convention_report import check_poses
 from imutool.log_info.imu_motion import motion_of
 from imutool.recording import Poses, Recording
 from imutool.sensor.effects.vibration import is_motion
@@ -39,8 +40,9 @@ def align_with_poses(real: Recording, settings: DiagnoseSettings) -> Iterator[Pa
     """Stretches of a recording that its true poses cover without a hole.
 
     Raises:
-        DataError: no stretch is long enough, or the poses cannot be differentiated.
+        DataError: no stretch is long enough, or the poses cannot be differentiated, or their quaternions or unit are misread.
     """
+    check_poses(real, world=False, warn=False)
     real = _with_z_up(real)
     motion = smooth_motion(real.truth)
     pairs = list(_pairs(real, motion, settings))
