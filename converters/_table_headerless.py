@@ -208,8 +208,7 @@ def _words(line: str) -> tuple[str, ...]:
 def _names(words: tuple[str, ...]) -> list[str]:
     """Names of the numbers: an axis alone is of the group before it, and numbers that follow without a label are counted."""
     group, label, place, names = "", "", 0, list[str]()
-    labels = [_label(text) for text in words]
-    for (own, _), (following, unit) in pairwise(labels):
+    for (own, _), (following, unit) in pairwise(map(_label, words)):
         if own:
             is_axis = AXIS.fullmatch(own[-1])
             group = " ".join(own[:-1] if is_axis else own) or group

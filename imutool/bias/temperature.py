@@ -48,12 +48,11 @@ def _form(sensor: Sensor) -> LinearForm:
     lags = ("", *(f"{tau_s:g}s_" for tau_s in LOAD_TAU_S))
     names = [f"{axis}_{lag}p{order}" for axis in AXES for lag in lags for order in range(1, ORDERS + 1)]
     parameters = tuple(Parameter(name, unit, plausible) for name in names)
-    equation = f"{sensor} += K (x - mean), x = P(T) at once and behind dz/dt = (P(T) - z) / tau"
     effect = Effect(
         f"{sensor}_temperature",
         Stage.SENSOR,
         (sensor,),
-        equation,
+        f"{sensor} += K (x - mean), x = P(T) at once and behind dz/dt = (P(T) - z) / tau",
         parameters,
         "the log's temperature varies",
         forward,

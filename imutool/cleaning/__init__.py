@@ -73,8 +73,7 @@ def cleaned(log: Log, survey: Survey, end_ns: int | None) -> Iterator[ImuBatch]:
     Raises:
         LogError: damage, or a log that has grown since it was surveyed.
     """
-    clean = Cleaner(survey)
-    for batch in map(clean, raw_batches(log, survey.topic)):
+    for batch in map(Cleaner(survey), raw_batches(log, survey.topic)):
         count = len(batch.stamp_ns) if end_ns is None else int(np.searchsorted(batch.stamp_ns, end_ns, side="right"))
         if count < len(batch.stamp_ns):
             yield rows(batch, slice(count))

@@ -106,8 +106,7 @@ class Intervals:
             part = stamp_ns[: int(np.argmax(far)) if far.any() else len(far)]
             first, last = self.intervals[-1]
             self.intervals[-1] = min(first, int(part.min())), max(last, int(part.max()))
-        starts = np.flatnonzero(far)
-        for start, end in pairwise([*starts, len(far)]):
+        for start, end in pairwise([*np.flatnonzero(far), len(far)]):
             if len(self.intervals) == MAX_INTERVALS:
                 self.left_out += 1
             else:

@@ -81,7 +81,7 @@ class Corrections:
 
     def put_on(self, content: MessageLog) -> MessageLog:
         """Log with corrected messages, and the record of what was corrected."""
-        content.remarks.notes.extend([f"{topic}: {note}" for topic, note in self.notes.items()])
+        content.remarks.notes.extend(f"{topic}: {note}" for topic, note in self.notes.items())
         earlier = content.metadata.get(RECORD, {})  # of another round, or of an earlier command
         record = {topic: "; ".join(filter(None, (earlier.get(topic), note))) for topic, note in self.notes.items()}
         metadata = {**content.metadata, RECORD: {**earlier, **record}}

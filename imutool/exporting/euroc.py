@@ -264,8 +264,7 @@ class _Asl:
         rate_hz, kept = self._stamps.clock().rate_hz, self._kept("imu0/sensor.yaml")
         assert rate_hz is not None  # two samples or more, whose stamps increase
         self._text("imu0/sensor.yaml", imu_yaml(self.recording, kept, rate_hz, given))
-        folders = {name.split("/")[0] for name in self.written}
-        for folder in sorted(folders - {"imu0"}):
+        for folder in sorted({name.split("/")[0] for name in self.written} - {"imu0"}):
             if text := self._kept(f"{folder}/sensor.yaml"):
                 self._text(f"{folder}/sensor.yaml", text)
         if text := self._kept("body.yaml"):

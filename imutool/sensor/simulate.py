@@ -228,12 +228,11 @@ def _exact(motion: SmoothMotion, ideals: Sequence[IdealMotion], stamps: Sequence
     for stretch in motion.stretches:
         own = [s for s, ideal in zip(stamps, ideals, strict=True) if stretch.start_s <= ideal.t_s[0] <= stretch.end_s]
         parts += [stretch.trajectory.poses(_nanoseconds(motion, stamp_s)) for stamp_s in own]
-    velocities = [part.v_w for part in parts if part.v_w is not None]
     return Poses(
         np.concatenate([part.t_ns for part in parts]),
         np.concatenate([part.p_wb for part in parts]),
         np.concatenate([part.q_wb_wxyz for part in parts]),
-        np.concatenate(velocities),
+        np.concatenate([part.v_w for part in parts if part.v_w is not None]),
     )
 
 

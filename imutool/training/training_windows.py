@@ -218,8 +218,7 @@ def corrected(
     nothing = pool.t.new_zeros(1, 6)
     wanted = torch.ones_like(pool.held_out) if part == "all" else pool.held_out == (part == "held_out")
     for log in range(len(pool.names)):
-        rows = torch.nonzero(wanted & (pool.log == log))[:, 0]
-        for some in torch.split(rows, CHUNK):
+        for some in torch.split(torch.nonzero(wanted & (pool.log == log))[:, 0], CHUNK):
             index = pool.around(some[:1], model.context, len(some) - 1)[0]
             t = pool.t[index]
             segment = Segment((t - t[0])[None], pool.gyro[index][None], pool.accel[index][None], nothing)

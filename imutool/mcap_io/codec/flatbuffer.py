@@ -211,9 +211,8 @@ class FlatBuffer:
 
 
 def _object(table: _Table) -> Object:
-    fields = [_field(part) for part in table.tables(1)]
     return Object(
-        {field.name: field for field in fields if field.base},
+        {field.name: field for field in map(_field, table.tables(1)) if field.base},
         bool(table.number(2, "B")),
         max(1, min(int(table.number(3, "i")), 16)),
         int(table.number(4, "i")),

@@ -169,8 +169,7 @@ class RecordFrames:
     def find_next(self, start: int, limit: int, channels: set[int]) -> int:
         """Offset of the next valid record or log from `start` on; `limit` if there is none."""
         for at in range(start, limit, WINDOW):
-            raw = self.source.at(at, min(WINDOW + len(MAGIC), self.limit - at))
-            for offset in self._candidates(raw, at):
+            for offset in self._candidates(self.source.at(at, min(WINDOW + len(MAGIC), self.limit - at)), at):
                 position = at + offset
                 if position >= limit or self.candidates > MAX_CANDIDATES:
                     return limit

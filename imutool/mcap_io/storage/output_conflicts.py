@@ -123,11 +123,10 @@ def _check_name(output: OutputFile) -> None:
         return
     if isinstance(place, Path) and (is_stream(place) or (output.may_be_folder and place.is_dir())):
         return
-    expected = " or ".join(output.suffixes)
     raise UsageError(
         f"the suffix {place.suffix!r} does not fit what is written",
         where=place,
-        expected=expected,
+        expected=" or ".join(output.suffixes),
         fix=f"Choose a name for `{output.parameter}` that ends in {output.suffixes[0]}",
     )
 

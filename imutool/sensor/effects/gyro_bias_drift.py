@@ -71,11 +71,10 @@ def within(effects: Sequence[Effect], end_s: float) -> Iterator[Effect]:
 def _steady(warming: Effect, share: float) -> Effect:
     *amplitudes, tau = warming.parameters
     sizes = (replace(amplitude, plausible=amplitude.plausible / share) for amplitude in amplitudes)
-    fixed = replace(tau, plausible=STEADY_TAU_S, null_value=STEADY_TAU_S)
     return replace(
         warming,
         variant="steady",
-        parameters=(*sizes, fixed),
+        parameters=(*sizes, replace(tau, plausible=STEADY_TAU_S, null_value=STEADY_TAU_S)),
         forward=lambda samples, theta: warming.forward(samples, np.append(theta[:3], STEADY_TAU_S)),
         starts=starts_at([0.0, 0.0, 0.0, STEADY_TAU_S]),
         reached=None,

@@ -241,8 +241,7 @@ def _chain(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], orde
 
 def following(state: State, efforts: Columns) -> list[int]:
     """Joints whose efforts follow from the motion of all joints."""
-    n = efforts.shape[1]
-    if n > MAX_JOINTS:
+    if efforts.shape[1] > MAX_JOINTS:
         return []
     residual_std = _general_fit(state, efforts)[1]
     return np.flatnonzero(residual_std < WELL_DETERMINED * np.maximum(efforts.std(axis=0), 1e-12)).tolist()

@@ -165,12 +165,11 @@ def position_effects(scale: Scale) -> Iterator[Effect]:
         "the joint turns both ways",
     )
     yield replace(backlash, linear=False, starts=_gaps)
-    waves = (Parameter("sine", scale.units[0], PLAUSIBLE_RAD), Parameter("cosine", scale.units[0], PLAUSIBLE_RAD))
     yield scale.effect(
         "eccentricity",
         (0,),
         "position += sine sin(position) + cosine cos(position)",
-        waves,
+        (Parameter("sine", scale.units[0], PLAUSIBLE_RAD), Parameter("cosine", scale.units[0], PLAUSIBLE_RAD)),
         lambda s, theta: s.with_added(0, theta[0] * np.sin(s.x[:, 0]) + theta[1] * np.cos(s.x[:, 0])),
         "the joint turns through most of a circle",
     )

@@ -55,12 +55,11 @@ def _declined(s: SignalSamples, theta: Theta) -> SignalSamples:
 
 def magnetometer_effects(scale: Scale) -> Iterator[Effect]:
     """Soft iron, misalignment, and with an attitude the declination."""
-    entries = tuple(Parameter(AXES[i] + AXES[j], "-", 0.1) for i, j in PAIRS)
     yield scale.effect(
         "soft_iron",
         scale.columns,
         "field = S field, S symmetric",
-        entries,
+        tuple(Parameter(AXES[i] + AXES[j], "-", 0.1) for i, j in PAIRS),
         _soft,
         "it turns about two axes",
         starts=[np.zeros(6)],

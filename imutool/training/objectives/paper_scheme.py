@@ -142,8 +142,7 @@ def biases_from_poses(pool: Pool, smoothed: int) -> tuple[Biases, Bool[Tensor, "
     if smoothed > CUBIC:
         from scipy.signal import savgol_filter  # half a second to import
 
-        ends = (torch.nonzero(~known)[:, 0] + 1).tolist()
-        for first, end in itertools.pairwise([0, *ends]):
+        for first, end in itertools.pairwise([0, *(torch.nonzero(~known)[:, 0] + 1).tolist()]):
             if end - 1 - first >= smoothed:
                 some = biases[first : end - 1].cpu().numpy()
                 biases[first : end - 1] = torch.from_numpy(savgol_filter(some, smoothed, CUBIC, axis=0)).to(biases)

@@ -75,7 +75,6 @@ def _draw(figure: Any, *, source: CurveSource, sensor: Sensor) -> None:
     axes.set_xlabel("averaging time (s)")
     axes.set_ylabel(f"Allan deviation ({UNITS[sensor]})")
     plain_tick_labels(axes.xaxis, axes.yaxis)
-    named = sorted({name for slopes in source.slopes[sensor] for name in slopes.seen}, key=list(LINES).index)
-    for name in named:
+    for name in sorted({name for slopes in source.slopes[sensor] for name in slopes.seen}, key=list(LINES).index):
         axes.plot([], [], color=SOFT, lw=0.9, ls=LINES[name], label=name)
     legend(figure, axes.get_legend_handles_labels()[0])

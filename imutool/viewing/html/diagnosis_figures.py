@@ -237,8 +237,7 @@ def _stretches(trace: Traces, part: slice, after: bool) -> Iterator[Float64[np.n
     """Residual over unseen time, split where samples are missing."""
     residual = (trace.real - (trace.after if after else trace.before))[:, part]
     rows = np.flatnonzero(held_out_mask(trace) & np.isfinite(residual).all(axis=1))
-    steps = np.diff(trace.t_s[rows]) > GAP_PERIODS / rate_hz(trace)
-    for piece in np.split(rows, np.flatnonzero(steps) + 1):
+    for piece in np.split(rows, np.flatnonzero(np.diff(trace.t_s[rows]) > GAP_PERIODS / rate_hz(trace)) + 1):
         if len(piece) >= MIN_SAMPLES:
             yield residual[piece]
 

@@ -37,8 +37,7 @@ def held_out_stretches(trace: Traces) -> Iterator[Stretch]:
     if trace.truth is None or trace.ideal is None or not trace.truth.has_positions:
         return
     rows = np.flatnonzero(held_out_mask(trace) & np.isfinite(trace.ideal).all(axis=1))
-    breaks = np.flatnonzero(np.diff(trace.t_s[rows]) > GAP_PERIODS / rate_hz(trace)) + 1
-    for piece in np.split(rows, breaks):
+    for piece in np.split(rows, np.flatnonzero(np.diff(trace.t_s[rows]) > GAP_PERIODS / rate_hz(trace)) + 1):
         count = max(1, int(np.ceil(len(piece) / (MAX_S * rate_hz(trace)))))
         for part in np.array_split(piece, count):
             if len(part) >= MIN_S * rate_hz(trace):
