@@ -19,7 +19,7 @@ from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.likelihood import axis_names
 from imutool.conversion.common_setup import combined, fitted_to
 from imutool.conversion.corrections import CONVENTIONS, NOT_TURNED, STAMPS, Corrections, pose_notes
-from imutool.conversion.message_writer import write_log
+from imutool.conversion.message_writer import BULKY, write_log
 from imutool.conversion.restamping import find_stamps
 from imutool.log_info.imu_samples import ImuSamples
 from imutool.log_info.pose_imu_rotation import Body, agreement_in, body_of, frames_of_copies, is_straight, turned_body
@@ -169,7 +169,7 @@ def _with_stamps(first: Corrections, log: Path, wanted: Sequence[str]) -> Correc
 def _rounds(log: Path, wanted: Sequence[str], first: Corrections | None = None) -> tuple[list[Corrections], list[str]]:
     """Corrections of one round after the other, and what stays wrong.
 
-    After each round a log without images and numbers, in a new folder next to `log`, shows what the next has to correct.
+    After each round a log of what shows errors (`_judged`), in a new folder next to `log`, shows what the next has to correct.
     """
     judged, rounds, kept = log, list[Corrections](), list[str]()
     maximum = MAX_ROUNDS if CONVENTIONS in wanted else 1
@@ -198,10 +198,10 @@ def _content(log: Path, *, images: bool = True) -> MessageLog:
 
 
 def _judged(log: Path) -> MessageLog:
-    """Content of a log without images and single numbers, which show nothing to correct."""
+    """Content of a log without images, point clouds and single numbers, which show nothing to correct."""
     content = _content(log, images=False)
     with Log(log) as opened:
-        left_out = {topic.name for topic in opened.topics.values() if topic.schema_name == schemas.FLOAT}
+        left_out = {topic.name for topic in opened.topics.values() if topic.schema_name in (schemas.FLOAT, *BULKY)}
 
     def messages() -> Iterator[Message]:
         return (message for message in content.messages() if message.topic.name not in left_out)

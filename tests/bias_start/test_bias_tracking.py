@@ -136,7 +136,7 @@ def test_a_width_that_the_log_does_not_show_is_counted() -> None:
     """Widths evenly spread in their logarithm: before the log shows anything, the variance is the mean of their squares."""
     prior = replace(KNOWN, std=np.full(6, 1e-2), minimum=LeastWidth(np.full(6, 1e-3)))
     first = forward(biased(3, still_s=0.0), prior)[0]
-    blind = replace(first.step.after, P=np.diag([1.0] * 9 + [1e-4] * 6 + [1e-6] * 6))
+    blind = first.step.after._replace(P=np.diag([1.0] * 9 + [1e-4] * 6 + [1e-6] * 6))
     _, (P,) = prior.supported([blind], np.zeros(1), np.array([False]))
     exact = (1e-4 - 1e-6) / (2 * np.log(10.0))
     np.testing.assert_allclose(np.diag(P), exact, rtol=0.1)

@@ -19,8 +19,10 @@ from imutool import registry
 from imutool.api.models import debias as debias_log
 from imutool.bias.model_file import shipped_for
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD
+from imutool.conversion import correction_rounds
 from imutool.conversion.common_setup import fitted_to, shared
 from imutool.conversion.corrections import RECORD, Corrections
+from imutool.conversion.message_writer import write_log
 from imutool.conversion.run import convert
 from imutool.converters import fetch
 from imutool.errors import LogError
@@ -30,7 +32,7 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording
-from imutool.recording.message_log import Message
+from imutool.recording.message_log import Message, MessageLog
 from imutool.sensor.made_up_flight import flight
 
 P = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
@@ -300,6 +302,35 @@ def test_a_small_delay_does_not_turn_the_body(tmp_path: Path) -> None:
         for name in ("late", "punctual")
     )
     assert np.degrees((late * punctual.inv()).magnitude()).max() < 0.2
+
+
+def test_point_clouds_are_written_once_and_not_in_every_round(
+    made: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(replace(made, imu=replace(made.imu, gyro=made.imu.gyro @ P.T, accel=made.imu.accel @ P.T)), tmp_path / "turned.mcap")
+    with (tmp_path / "turned.mcap").open("rb") as file, (tmp_path / "clouds.mcap").open("wb") as target:
+        writer = Writer(target)
+        writer.start("ros2")
+        cloud = writer.register_schema("sensor_msgs/msg/PointCloud2", "ros2msg", b"uint8[] data")
+        channels = {"/points": writer.register_channel("/points", "cdr", cloud)}
+        for schema, channel, message in make_reader(file).iter_messages():
+            if channel.topic not in channels:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", kind, channel.metadata)
+            writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+        writer.add_message(channels["/points"], message.log_time, b"\0\1\0\0\0\0\0\0", message.log_time)
+        writer.finish()
+    written: list[set[str]] = []
+
+    def noted(content: MessageLog, *args: object, **options: object) -> None:
+        written.append({message.topic.name for message in content.messages()})
+        write_log(content, *args, **options)
+
+    monkeypatch.setattr(correction_rounds, "write_log", noted)
+    convert(tmp_path / "clouds.mcap", tmp_path / "right.mcap", fix=True)
+    assert ["/points" in topics for topics in written] == [False] * (len(written) - 1) + [True]
+    assert len(written) > 1
+    assert all("/imu0" in topics for topics in written)
 
 
 def test_poses_of_another_frame_keep_their_clock(tmp_path: Path) -> None:

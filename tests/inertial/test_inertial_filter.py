@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -34,7 +32,7 @@ STD = np.array([3e-3] * 3 + [0.2] * 3 + [1e-3] * 3 + [0.03] * 3)
 def start(heading: float = 0.0) -> State:
     x = first_state(np.array([0.5, -0.3, 9.7]), np.zeros(6), STD, S)
     turn = Rotation.from_euler("z", heading).as_matrix()
-    return replace(x, R_wb=turn @ x.R_wb, v_w=turn @ x.v_w, p_wb=turn @ x.p_wb)
+    return x._replace(R_wb=turn @ x.R_wb, v_w=turn @ x.v_w, p_wb=turn @ x.p_wb)
 
 
 def steps(x: State, count: int = 20, seed: int = 0) -> list[Step]:
@@ -87,7 +85,7 @@ def test_heading_is_never_found_out() -> None:
     x = start()
     P = x.P.copy()
     P[2, 2] = 1.0
-    x = replace(x, P=P)
+    x = x._replace(P=P)
     assert steps(x)[-1].after.P[2, 2] > 1.0
 
 
@@ -151,8 +149,8 @@ def test_smoothing_a_linear_case_is_least_squares() -> None:
 
 def test_a_stop_counts_in_full_however_fast_the_estimate() -> None:
     """At rest a large velocity is the filter's own error; in motion it may be the body's, and counts less."""
-    x = replace(start(), v_w=np.array([30.0, 0.0, 0.0]), steady=np.zeros(6))
+    x = start()._replace(v_w=np.array([30.0, 0.0, 0.0]), steady=np.zeros(6))
     P = x.P.copy()
     P[VELOCITY, VELOCITY] = np.eye(3)
-    after = rest_step(replace(x, P=P), np.array([0.0, 0.0, 0.0, 0.5, -0.3, 9.7]), np.full(3, 1e-8), 0.5, WALK, S)
+    after = rest_step(x._replace(P=P), np.array([0.0, 0.0, 0.0, 0.5, -0.3, 9.7]), np.full(3, 1e-8), 0.5, WALK, S)
     assert np.diag(after.after.P[VELOCITY, VELOCITY]).max() < 1.01 * S.rest_m_s**2

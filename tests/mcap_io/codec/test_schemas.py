@@ -215,3 +215,11 @@ def test_no_messages_encode_to_no_rows() -> None:
     rows = encode_imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), "imu0")
     assert rows.shape == (0, 4 + 24 + 37 * 8)
     assert list(schemas.runs(rows, schemas.IMU)) == []
+
+
+def test_a_layout_fits_the_messages_that_lie_alike_alone() -> None:
+    """`convert --fix` writes into a message where the last one of its topic had its fields."""
+    stamp, vectors = np.zeros(1, np.int64), np.zeros((1, 3))
+    first, other, longer = (encode_imu(stamp, vectors, vectors, frame)[0].tobytes() for frame in ("imu", "cam", "imu_link"))
+    layout = schemas.layout_of(schemas.IMU, "cdr", message=first)
+    assert [layout.fits(message) for message in (first, other, longer, first[:-1])] == [True, False, False, False]
