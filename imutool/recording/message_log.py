@@ -85,7 +85,7 @@ class Remarks:
 
 
 def named_kind(topic: str, schema_name: str) -> str:
-    """What poses are worth by the words of their topic's name, then by their type; `COMMAND` of those of no body."""
+    """Kind of poses by their topic's name, then by their type; `COMMAND` of those of no body."""
     words = "_".join(filter(None, re.split(r"[^a-z0-9]+", topic.lower())))
     for kind, pattern in KIND_WORDS.items():
         if re.search(rf"(^|_)({pattern})(_|$)", words):

@@ -1,4 +1,4 @@
-"""Units of an IMU's rates and accelerations that the comments of a ROS definition state."""
+"""IMUs in messages of other types, and the units that their definitions state."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import struct
 
 import numpy as np
 import pytest
+from google.protobuf import descriptor_pb2, timestamp_pb2
 
 from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
 
@@ -61,3 +62,19 @@ def test_the_units_in_a_json_schema_count_both_ways(key: str) -> None:
     np.testing.assert_allclose(sample.values, VALUES * np.repeat([DEG, G], 3), rtol=1e-12)
     again = json.loads(found.from_cdr(found.encode([sample]))[0])
     np.testing.assert_allclose([*again["gyro"].values(), *again["accel"]], VALUES, rtol=1e-12)
+
+
+@pytest.mark.parametrize("order", ["as imported", "imported last", "not imported"])
+def test_the_files_of_a_protobuf_schema_come_in_any_order(order: str) -> None:
+    time = descriptor_pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(time)
+    own = descriptor_pb2.FileDescriptorProto(name="imu.proto", package="my", syntax="proto3", dependency=[time.name])
+    imu = own.message_type.add(name="Imu")
+    imu.field.add(name="stamp", number=1, label=1, type=11, type_name=".google.protobuf.Timestamp")
+    imu.field.add(name="gyro", number=2, label=3, type=1)
+    imu.field.add(name="accel", number=3, label=3, type=1)
+    files = {"as imported": [time, own], "imported last": [own, time], "not imported": [own]}[order]
+    found = reflect("protobuf", "/imu", "my.Imu", descriptor_pb2.FileDescriptorSet(file=files).SerializeToString(), None)
+    assert found is not None
+    raw = b"\x0a\x04\x08\x07\x10\x05" + b"".join(bytes([tag, 24]) + struct.pack("<3d", 1, 2, 3) for tag in (0x12, 0x1A))
+    assert found.sample(raw, 0) == (7_000_000_005, "", [1, 2, 3, 1, 2, 3])
