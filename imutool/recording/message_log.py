@@ -22,8 +22,8 @@ COMMAND = "command"  # where a robot shall go: poses that are of no body
 KIND_WORDS = {  # in the names of topics
     "truth": "ground_truth|groundtruth|gt|truth|mocap|vicon|vrpn|optitrack|qualisys|natnet",
     COMMAND: "set_?points?|goals?|way_?points?|desired|planned|cmd|command(s|ed)?|target_pose",
-    "estimate": r"filter(ed)?|fused|fusion|estimat(e|ed|or|ion)|ekf|ukf|kalman|slam\d?|vio|vins|msckf|okvis|orb|lio|amcl|ndt|rovio|svo|"
-    "localization|tracked_pose|local_position|vision|zed_node",
+    "estimate": r"filter(ed)?|fused|fusion|estimat(e|ed|or|ion)|ekf|ukf|kalman|slam\d?|vio|vins|msckf|okvis|orb|lio|amcl|ndt|"
+    "rovio|svo|localization|tracked_pose|local_position|vision|zed_node",
     "odometry": "odom|odometry|wheel|wheels|encoder|encoders",
 }
 

@@ -1,9 +1,9 @@
-"""Foxglove's `FrameTransform` and `FrameTransforms` as TFMessage in CDR."""
+"""Foxglove's `FrameTransform` and `FrameTransforms` as TFMessage in CDR, and which frames of a tree are bodies."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, NamedTuple
@@ -20,7 +20,18 @@ from imutool.mcap_io.codec.schemas import NS_PER_S, TF
 TYPE = re.compile(r"(?:.*[./])?FrameTransform(s?)")
 FRAMES = "parent_frame_id", "child_frame_id"
 NUMBERS = *(("translation", axis) for axis in "xyz"), *(("rotation", axis) for axis in "wxyz")
+WORLD = re.compile(r"(.*[/_])?(map|odom|world|earth)(_combined|_frame)?")
 STAMPS = ("seconds", "nanos"), ("sec", "nsec")
+
+
+def bodies(pairs: Collection[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Parents and children of a tree whose poses are those of a body in a world.
+
+    Worlds are frames without a parent, and `map` and `odom` (REP 105): joints move in a body.
+    """
+    children = {child for _, child in pairs}
+    in_worlds = [pair for pair in pairs if pair[0] not in children or WORLD.fullmatch(pair[0])]
+    return [pair for pair in in_worlds if not WORLD.fullmatch(pair[1])] or in_worlds or [*pairs]
 
 
 class Transform(NamedTuple):
