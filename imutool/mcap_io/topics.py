@@ -30,7 +30,7 @@ from imutool.mcap_io.index import LogIndex
 from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import named_kind
 
-ENCODINGS = ("cdr", "ros1")
+ENCODINGS, DESCRIBED = ("cdr", "ros1"), {("ros2msg", "cdr"), ("ros1msg", "ros1")}
 REFLECTED = ("protobuf", "json", "flatbuffer")  # encodings whose messages are searched for those of an IMU and for poses
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
 PART_KEY = "imutool_part_of"  # channel metadata: one sensor of the IMU on that topic
@@ -255,9 +255,9 @@ def reflected_topics(
     odd = {n for n, t in imus.items() if not t.reflected and not all(map(ros2_definition.is_imu_of_ros, texts[n]))}
     known = any(not topic.is_derived for name, topic in imus.items() if name not in odd)
     for name, topic in topics.items():
-        described = (topic.schema_encoding, topic.message_encoding, topic.is_derived) == ("ros2msg", "cdr", False)
+        described = (topic.schema_encoding, topic.message_encoding) in DESCRIBED and not topic.is_derived
         definition = definitions[name] if described and (name in odd or not known) else None
-        imu = None if definition is None else reflect_cdr(topic.schema_name, definition.data)
+        imu = None if definition is None else reflect_cdr(topic.schema_name, definition.data, topic.message_encoding)
         if imu is not None and _have_one_layout(topic, texts[name]):
             found[name] = _as_ros(topic, imu)
         elif imu is not None or name in odd:  # whose bytes would be read in the order of another

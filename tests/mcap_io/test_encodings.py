@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from imutool.errors import LogError
 from imutool.file_location import to_location
 from imutool.mcap_io.fields import numeric_fields, others, read_field
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
 
 START_NS, PERIOD_NS, COUNT = 1_700_000_000_123_456_789, 20_000_000, 50
 KIND = "sensor_msgs/msg/JointState"
@@ -254,3 +256,13 @@ def test_numbers_of_an_imu_in_its_own_type_are_those_it_has(tmp_path: Path) -> N
         assert log.imu_topics == ["/imu"]
     assert read_field(path, "/imu.temp").values.tolist() == [20.0 + row for row in range(9)]
     assert set(others(path, "")) == {"/imu.gyro[0]", "/imu.temp"}
+
+
+def test_an_imu_of_its_own_type_in_ros_1_is_one(tmp_path: Path) -> None:
+    text = b"Header header\nfloat32[3] gyro\nfloat32[3] accel\n" + b"=" * 80
+    text += b"\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+    rows = [struct.pack("<4I3s6f", row, 7, row, 3, b"imu", row, 0, 0, 0, 0, 9.75) for row in range(9)]
+    recording = read(to_location(str(write(tmp_path / "imu.mcap", ("driver/Imu", "ros1msg", text), "ros1", rows, "/imu"))))
+    assert recording.imu.t_ns.tolist() == [7_000_000_000 + row for row in range(9)]
+    assert np.array_equal(recording.imu.gyro[:, 0], np.arange(9.0))
+    assert (recording.imu.accel == [0.0, 0.0, 9.75]).all()

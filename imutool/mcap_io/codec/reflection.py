@@ -219,10 +219,10 @@ def tree_of(form: Any, first: bytes) -> Any:
     return form.tree(form.parse(first)) if isinstance(form, Json) else form.tree(DEPTH)
 
 
-def reflect_cdr(schema_name: str, schema: bytes) -> Reflected | None:
-    """Fields of an IMU in a `ros2msg` definition; None of any other message."""
+def reflect_cdr(schema_name: str, schema: bytes, encoding: str = "cdr") -> Reflected | None:
+    """Fields of an IMU in a definition of ROS; None of any other message."""
     try:
-        form = ros2_definition.DescribedCdr(ros2_definition.parse(schema_name, schema))
+        form = ros2_definition.DescribedCdr(ros2_definition.parse(schema_name, schema), encoding)
     except LogError:
         return None
     found = _found(form.tree(DEPTH), form)
