@@ -104,7 +104,7 @@ def ros1_definition(schema_name: str) -> str:
 
 
 def canonical(schema_name: str) -> str:
-    """ROS 2 spelling of a schema's name: `sensor_msgs/msg/Imu` for `sensor_msgs/Imu` and `sensor_msgs::msg::dds_::Imu_`."""
+    """ROS 2 spelling of a name: of `sensor_msgs/Imu` and `sensor_msgs::msg::dds_::Imu_`."""
     if dds := DDS_NAME.fullmatch(schema_name):
         return f"{dds[1]}/msg/{dds[2]}"
     package, slash, name = schema_name.partition("/")

@@ -1,4 +1,4 @@
-"""Foxglove's `FrameTransform` and `FrameTransforms` as TFMessage in CDR, and which frames of a tree are bodies."""
+"""Foxglove's `FrameTransform(s)` as TFMessage in CDR, and the bodies of a tree of frames."""
 
 from __future__ import annotations
 
