@@ -38,6 +38,16 @@ def fields(gyro: str, accel: str, above: str = "") -> str:
         (fields("", "", above="# angular rate (dps)\n\n"), 1.0, 1.0),
         (fields(" # rad/s, not deg/s", " # x axis of the gyro"), 1.0, 1.0),
         ("float64[3] gyro  # deg/sec\nfloat64[3] accel  # (g)\n", DEG, G),
+        ("float64[3] gyro_dps\nfloat64[3] acc_mg\n", DEG, 1e-3 * G),
+        (
+            "".join(
+                f"float64 {name}\n" for name in ("gyroX_deg_s", "gyroY_deg_s", "gyroZ_deg_s", "accX_g", "accY_g", "accZ_g")
+            ),
+            DEG,
+            G,
+        ),
+        ("float64[3] angular_velocity_rad_s  # as deg/s on the display\nfloat64[3] accel_mps2\n", 1.0, 1.0),
+        ("".join(f"float64 {name}\n" for name in ("gx", "gy", "gz", "ax", "ay", "az")), 1.0, 1.0),
         ("Vec gyro # °/s\nVec accel\n" + "=" * 80 + "\nMSG: my_driver/Vec\nfloat64 x\nfloat64 y\nfloat64 z\n", DEG, 1.0),
     ],
 )
@@ -50,6 +60,20 @@ def test_a_correction_is_written_in_the_unit_of_the_message() -> None:
     found = reflected(fields("  # deg/s", "  # g"))
     turned = found.with_vectors(RAW, np.stack([np.diag([1.0, -1.0, -1.0])] * 2))
     np.testing.assert_allclose(struct.unpack("<6d", turned[4:]), np.multiply(VALUES, [1, -1, -1, 1, -1, -1]), rtol=1e-12)
+
+
+def test_parts_of_a_json_schema_state_units_where_a_field_refers_to_them() -> None:
+    vector = {"type": "object", "title": "Vector"}
+    parts = {
+        "Rate": {"allOf": [vector, {"description": "deg/s"}]},
+        "Force": {**vector, "unit": "g"},
+        "Loop": {"$ref": "#/$defs/Loop"},
+    }
+    fields = {"gyro": {"$ref": "#/$defs/Rate"}, "accel": {"anyOf": [{"$ref": "#/$defs/Loop"}, {"$ref": "#/$defs/Force"}]}}
+    raw = json.dumps({name: dict(zip("xyz", [1, 2, 3], strict=True)) for name in fields}).encode()
+    found = reflect("json", "/imu", "Imu", json.dumps({"properties": fields, "$defs": parts}).encode(), raw)
+    assert found is not None
+    assert found.sizes == (DEG, G)
 
 
 @pytest.mark.parametrize("key", ["description", "unit"])
