@@ -25,7 +25,7 @@ from imutool.mcap_io.codec.decode import (
 from imutool.mcap_io.codec.joined_imu import JoinedImu, Vectors, whole_of
 from imutool.mcap_io.codec.messages import Messages, Rows
 from imutool.mcap_io.codec.reflection import Reflected, format_of, reflect, reflect_cdr
-from imutool.mcap_io.codec.transforms import TYPE, Transforms
+from imutool.mcap_io.codec.transforms import TYPE, Transforms, named_poses
 from imutool.mcap_io.index import LogIndex
 from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import named_kind
@@ -231,7 +231,7 @@ def reflected_topics(
     `firsts` gives the first messages of some. Types of ROS 2 count only if no other IMU was recorded: drivers publish both.
     """
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
-    found: dict[str, Topic] = {}
+    found = {n: _as_ros(t, p) for n, t in topics.items() if (p := named_poses(definitions[n], t.message_encoding)) is not None}
     reflected = {n: t for n, t in topics.items() if t.message_encoding in REFLECTED and RECORDED_KEY not in t.metadata}
     in_json = [name for name, topic in reflected.items() if topic.message_encoding == "json"]
     texts_of = {name: definition.data if (definition := definitions[name]) else b"" for name in reflected}

@@ -27,6 +27,7 @@ KIND_WORDS = {  # in the names of topics
     "odometry": "odom|odometry|wheel|wheels|encoder|encoders",
 }
 
+TRUE_TYPES = r"^(mocap|motion_capture)\w*/"  # of messages
 ESTIMATED = r"PoseWithCovarianceStamped$|TFMessage$|FrameTransforms?$"  # a filter states its covariance, or moves the frames
 
 
@@ -90,6 +91,8 @@ def named_kind(topic: str, schema_name: str) -> str:
     for kind, pattern in KIND_WORDS.items():
         if re.search(rf"(^|_)({pattern})(_|$)", words):
             return kind
+    if re.search(TRUE_TYPES, schema_name):
+        return "truth"
     if re.search(r"[/.]Odometry$", f"/{schema_name}"):
         return "odometry"
     return "estimate" if re.search(ESTIMATED, schema_name) else "unknown"

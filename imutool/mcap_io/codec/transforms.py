@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
-from itertools import groupby
+from functools import reduce
+from itertools import count, groupby, takewhile
+from operator import getitem
 from typing import Any, NamedTuple
 
 import numpy as np
+from mcap.records import Schema
 
 from imutool.array_types import Bool
+from imutool.errors import LogError
 from imutool.mcap_io.codec.encode import encode_transforms
-from imutool.mcap_io.codec.formats import LACKS, Format
+from imutool.mcap_io.codec.formats import LACKS, Format, Path
 from imutool.mcap_io.codec.joined_imu import Cut
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
+from imutool.mcap_io.codec.ros2_definition import FORMATS, TEXT, Definition, Walk, parse
 from imutool.mcap_io.codec.schemas import NS_PER_S, TF
+from imutool.recording.message_log import TRUE_TYPES
 
 TYPE = re.compile(r"(?:.*[./])?FrameTransform(s?)")
 FRAMES = "parent_frame_id", "child_frame_id"
 NUMBERS = *(("translation", axis) for axis in "xyz"), *(("rotation", axis) for axis in "wxyz")
+NAME = re.compile(r"(.*_)?name")  # of a body
 WORLD = re.compile(r"(.*[/_])?(map|odom|world|earth)(_combined|_frame)?")
 STAMPS = ("seconds", "nanos"), ("sec", "nsec")
 
@@ -34,6 +43,58 @@ def bodies(pairs: Collection[tuple[str, str]]) -> list[tuple[str, str]]:
     return [pair for pair in in_worlds if not WORLD.fullmatch(pair[1])] or in_worlds or [*pairs]
 
 
+class NamedPoses:
+    """Messages of ROS with a list of named poses, read as transforms."""
+
+    def __init__(self, definition: Definition, encoding: str, names: tuple[str, str, str]) -> None:
+        self._definition, self._encoding, self._names = definition, encoding, names
+
+    def parse(self, raw: bytes) -> dict[str, Any]:
+        """Message as nested fields.
+
+        Raises:
+            ValueError: the bytes are no such message.
+        """
+        listed, name, pose = self._names
+        try:
+            walk = Walk(raw, self._definition, self._encoding)
+            numbers = {
+                leaf.path: struct.unpack_from(walk.order + FORMATS[leaf.kind], raw, leaf.offset)[0] for leaf in walk.leaves()
+            }
+        except LogError as error:
+            raise ValueError(error.what) from error
+        texts = {path: text.removesuffix(b"\0").decode(errors="replace") for path, _, text in walk.texts}
+        head: dict[str, Any] = {"parent_frame_id": texts.get("header.frame_id", "")}
+        if "header.stamp.sec" in numbers:
+            head["timestamp"] = {"sec": numbers["header.stamp.sec"], "nsec": numbers["header.stamp.nanosec"]}
+        found = []
+        for k in takewhile(lambda k: f"{listed}[{k}].{name}" in texts, count()):
+            at = f"{listed}[{k}]"
+            vectors = (("translation", "position", "xyz"), ("rotation", "orientation", "xyzw"))
+            parts = {to: {axis: numbers[f"{at}.{pose}.{of}.{axis}"] for axis in axes} for to, of, axes in vectors}
+            found.append({**head, "child_frame_id": texts[f"{at}.{name}"], **parts})
+        return {"transforms": found}
+
+    def at(self, message: Any, path: Path) -> Any:
+        """Value of a field; KeyError where the message lacks it."""
+        return reduce(getitem, path, message)
+
+
+def named_poses(schema: Schema | None, encoding: str) -> Transforms | None:
+    """Poses of the bodies that a motion capture names in one message; None of any other type."""
+    if schema is None or schema.encoding not in ("ros1msg", "ros2msg") or not re.search(TRUE_TYPES, schema.name):
+        return None
+    with suppress(LogError):
+        definition = parse(schema.name, schema.data)
+        for field in definition[definition[""][0].kind]:
+            inner = definition.get(field.kind, ()) if field.length is not None else ()
+            name = next((part.name for part in inner if part.kind == TEXT and NAME.fullmatch(part.name)), None)
+            pose = next((part.name for part in inner if (part.kind, part.length) == ("geometry_msgs/Pose", None)), None)
+            if name and pose:
+                return Transforms(NamedPoses(definition, encoding, (field.name, name, pose)), several=True)
+    return None
+
+
 class Transform(NamedTuple):
     """Pose of a child frame in its parent: stamp in ns, position, and quaternion wxyz."""
 
@@ -46,7 +107,7 @@ class Transform(NamedTuple):
 class Transforms:
     """Messages of one or several transforms; one that lacks a field is left out."""
 
-    format: Format
+    format: Format | NamedPoses
     several: bool
     schema_name: str = TF
 
