@@ -24,8 +24,8 @@ from imutool.mcap_io.codec.decode import (
 )
 from imutool.mcap_io.codec.joined_imu import JoinedImu, Vectors, whole_of
 from imutool.mcap_io.codec.messages import Messages, Rows
-from imutool.mcap_io.codec.reflection import Reflected, format_of, reflect, reflect_cdr
-from imutool.mcap_io.codec.transforms import TYPE, Transforms, named_poses
+from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
+from imutool.mcap_io.codec.transforms import Transforms, named_poses
 from imutool.mcap_io.index import LogIndex
 from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import named_kind
@@ -237,13 +237,8 @@ def reflected_topics(
     texts_of = {name: definition.data if (definition := definitions[name]) else b"" for name in reflected}
     by_first = {name: reflect("json", name, topics[name].schema_name, texts_of[name], raw) for name, raw in firsts(in_json)}
     for name, topic in reflected.items():
-        schema = texts_of[name]
         try:
-            several = TYPE.fullmatch(topic.schema_name)
-            if several and (form := format_of(topic.message_encoding, topic.schema_name, schema)):
-                found[name] = _as_ros(topic, Transforms(form, bool(several[1])))
-                continue
-            message = by_first.get(name) or reflect(topic.message_encoding, name, topic.schema_name, schema, None)
+            message = by_first.get(name) or reflect(topic.message_encoding, name, topic.schema_name, texts_of[name], None)
         except ImportError:
             continue
         if message is not None:

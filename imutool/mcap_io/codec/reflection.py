@@ -44,6 +44,7 @@ from imutool.mcap_io.codec.formats import (
 )
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
 from imutool.mcap_io.codec.schemas import GYRO_COVARIANCE, IMU, POSE, runs
+from imutool.mcap_io.codec.transforms import TYPE, Transforms
 
 POSITION = r"position|pos|translation|p"
 ORIENTATION = r"orientation|rotation|quaternion|quat|attitude|q"
@@ -175,8 +176,8 @@ def _parts(stamp_ns: int, places: Sequence[tuple[Path, int]]) -> Iterator[tuple[
         yield path, count
 
 
-def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: bytes | None) -> Reflected | None:
-    """Fields of an IMU or a pose in messages of a schema; None of any other message.
+def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: bytes | None) -> Reflected | Transforms | None:
+    """Fields of an IMU or a pose in messages of a schema, or transforms; None of any other message.
 
     JSON goes by the `first` message, protobuf and FlatBuffers by the schema.
 
@@ -184,6 +185,8 @@ def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: b
         ImportError: the schema is of protobuf, which is not installed.
     """
     form = format_of(encoding, schema_name, schema)
+    if form is not None and (several := TYPE.fullmatch(schema_name)):
+        return Transforms(form, bool(several[1]))
     try:
         tree = form and tree_of(form, first or b"")
     except ValueError:

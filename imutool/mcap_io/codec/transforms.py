@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import reduce
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from mcap.records import Schema
 
-from imutool.array_types import Bool
+from imutool.array_types import Bool, UInt8
 from imutool.errors import LogError
 from imutool.mcap_io.codec.encode import encode_transforms
 from imutool.mcap_io.codec.formats import LACKS, Format, Path
@@ -110,6 +110,24 @@ class Transforms:
     format: Format | NamedPoses
     several: bool
     schema_name: str = TF
+    units: str = ""  # that the schema states
+    stamp: bool = True  # or the log time in each that has none
+
+    def sample(self, raw: bytes, log_time: int) -> list[Transform]:
+        """Transforms of a message.
+
+        Raises:
+            ValueError: it has none.
+        """
+        if found := self._transforms(raw, log_time):
+            return found
+        raise ValueError("no transform in the message")
+
+    def encode(self, samples: Sequence[Sequence[Transform]]) -> UInt8[np.ndarray, "n L"]:
+        """Messages of the same frames as CDR."""
+        stamps = np.array([[each.stamp_ns for each in message] for message in samples], np.int64)
+        values = np.array([[each.values for each in message] for message in samples], np.float64)
+        return encode_transforms(stamps, values, [each.frames for each in samples[0]])
 
     def cut(self, found: Messages, mask: Bool[np.ndarray, " n"]) -> Cut:
         """Heads of the chosen messages, and their transforms as CDR, per stretch of the same frames."""
@@ -123,9 +141,7 @@ class Transforms:
         for frames, group in groupby(read, key=lambda entry: [transform.frames for transform in entry[1]]):
             rows, messages = zip(*group, strict=True)
             if frames:
-                stamps = np.array([[each.stamp_ns for each in message] for message in messages], np.int64)
-                values = np.array([[each.values for each in message] for message in messages], np.float64)
-                yield heads[list(rows)], encode_transforms(stamps, values, frames)
+                yield heads[list(rows)], self.encode(messages)
 
     def _transforms(self, raw: bytes, log_time: int) -> list[Transform]:
         try:
