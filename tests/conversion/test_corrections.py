@@ -589,7 +589,7 @@ def test_named_bodies_keep_their_unit_and_the_note_says_so(made: Recording, tmp_
     text = store.generate_msgdef(kind, ros_version=2)[0].encode()
     report = convert(in_mm(made, tmp_path, (kind, "ros2msg", text), "cdr", message), tmp_path / "fixed.mcap", fix=True)
     assert [note for note in report.notes if "/mocap/tf" in note] == [
-        f"fixed.mcap: /mocap/tf keeps its poses: only those in messages of ROS are corrected, not {kind}"
+        f"fixed.mcap: /mocap/tf keeps its poses: only those of ROS are corrected, not {kind}"
     ]
 
 

@@ -177,7 +177,7 @@ def _parts(stamp_ns: int, places: Sequence[tuple[Path, int]]) -> Iterator[tuple[
 
 
 def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: bytes | None) -> Reflected | Transforms | None:
-    """Fields of an IMU or a pose in messages of a schema, or transforms; None of any other message.
+    """Fields of an IMU, a pose or transforms in messages of a schema; None of others.
 
     JSON goes by the `first` message, protobuf and FlatBuffers by the schema.
 
