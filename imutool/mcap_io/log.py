@@ -120,7 +120,7 @@ class Log:
 
     def no_imu(self) -> LogError:
         """Error of a log without an IMU."""
-        fix = no_imu_fix((topic.schema_name, topic.message_encoding) for topic in self.topics.values())
+        fix = no_imu_fix((t.schema_name, t.message_encoding, t.schema_encoding) for t in self.topics.values())
         return LogError("the log has no IMU topic", where=self.path, expected=f"{schemas.IMU} among {self.listing()}", fix=fix)
 
     @property

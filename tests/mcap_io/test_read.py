@@ -459,6 +459,17 @@ def test_an_imu_whose_definition_has_another_order_is_read_in_its_own(tmp_path: 
     assert (imu.gyro[0].tolist(), imu.accel[0].tolist()) == ([0.1, 0.2, 0.3], [0.0, 0.0, 9.8])
 
 
+@pytest.mark.parametrize("encoding", ["cbor", "msgpack"])
+def test_a_log_whose_messages_are_not_searched_says_so(tmp_path: Path, encoding: str) -> None:
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_message(writer.register_channel("/imu", encoding, 0), 1, b"\xa0", 1)
+        writer.finish()
+    with pytest.raises(LogError, match=f"no IMU topic.* Messages in {encoding} are not searched for an IMU: record them as"):
+        read(tmp_path / "log.mcap")
+
+
 def test_several_imus_are_listed(foreign: Foreign, make: Make) -> None:
     path = foreign(imu_messages(make, "/left") + imu_messages(make, "/right"))
     with pytest.raises(LogError, match=r"2 IMU topics: /left, /right. Choose one with `imu`"):
