@@ -91,7 +91,7 @@ def choice_of(topics: Iterable[str]) -> str:
 
 
 def no_imu_fix(topics: Iterable[tuple[str, str, str]]) -> str:
-    """Hint for a log without an IMU, by the types and both encodings of its topics; may be empty."""
+    """Hint for a log without an IMU, by its topics' types and both encodings; may be empty."""
     types, encodings, languages = zip(*topics, strict=True) if (topics := list(topics)) else ((), (), ())
     if types.count(VECTOR3) > 1 or {*ACCELS} & {*types}:
         return "`imu` gyro=TOPIC,accel=TOPIC joins the vectors of a gyroscope (rad/s) and of an accelerometer (m/s²)"

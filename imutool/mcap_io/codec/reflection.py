@@ -246,14 +246,18 @@ def _in_si(found: Reflected, form: Format) -> Reflected:
 def _found(tree: Tree, form: Format) -> Reflected | None:
     """Fields of an IMU in the tree of a message's fields."""
     fields = [*fields_of(tree)]
-    gyro, accel = (_vector(fields, pattern) for pattern in (GYRO, ACCEL))
-    if gyro is None or accel is None:  # as programs of small boards name them: ax, ay, az, gx, gy, gz
-        gyro, accel = _vector(fields, "[gw]"), _vector(fields, "a")
-        if gyro is None or accel is None or gyro[0][:-1] != accel[0][:-1]:
-            return None
+    parts: dict[Path, list[tuple[Path, str, Any]]] = {}
+    for field in fields:
+        parts.setdefault(field[0][:-1], []).append(field)
+    long, short = (GYRO, ACCEL), ("[gw]", "a")  # short: ax, ay, az, gx, gy, gz
+    searched = *((part, long) for part in parts.values()), (fields, long), *((part, short) for part in parts.values())
+    pairs = ((part, _vector(part, gyro), _vector(part, accel)) for part, (gyro, accel) in searched)
+    part, gyro, accel = next((pair for pair in pairs if pair[1] and pair[2]), (fields, None, None))
+    if gyro is None or accel is None:
+        return None
     frame = next((path for path, name, node in fields if node == TEXT and re.fullmatch(FRAME, name)), None)
     covariances = [
-        next((path for path, name, node in fields if node == MATRIX and re.fullmatch(rf"{pattern}_?covariance", name)), None)
+        next((path for path, name, node in part if node == MATRIX and re.fullmatch(rf"{pattern}_?covariance", name)), None)
         for pattern in (GYRO, ACCEL)
     ]
     stamp, *others = [*stamps_of(fields)] or [()]

@@ -76,6 +76,14 @@ def test_parts_of_a_json_schema_state_units_where_a_field_refers_to_them() -> No
     assert found.sizes == (DEG, G)
 
 
+@pytest.mark.parametrize("part", [{"linear_acceleration": [7, 8, 9]}, {"left": {"accel": [7, 8, 9]}}, {"gyro": [7, 8, 9]}])
+def test_gyro_and_accelerometer_are_those_beside_each_other(part: dict[str, object]) -> None:
+    raw = json.dumps({**part, "imu": {"accel": [1, 2, 3], "gyro": [4, 5, 6]}}).encode()
+    found = reflect("json", "/state", "", b"", raw)
+    assert found is not None
+    assert found.sample(raw, 0).values == [4, 5, 6, 1, 2, 3]
+
+
 @pytest.mark.parametrize("key", ["description", "unit"])
 def test_the_units_in_a_json_schema_count_both_ways(key: str) -> None:
     schema = {"properties": {"gyro": {"type": "object", key: "deg/s"}, "accel": {"type": "array", key: "g"}}}
