@@ -114,19 +114,21 @@ class Transforms:
     stamp: bool = True  # or the log time in each that has none
 
     def sample(self, raw: bytes, log_time: int) -> list[Transform]:
-        """Transforms of a message.
+        """Transforms of a message, which may list none.
 
         Raises:
-            ValueError: it has none.
+            ValueError: they lack a field.
         """
-        if found := self._transforms(raw, log_time):
-            return found
+        found = self._transforms(raw, log_time)
+        with suppress(*LACKS):
+            if found or (self.several and not len(self.format.at(self.format.parse(raw), ("transforms",)))):
+                return found
         raise ValueError("no transform in the message")
 
     def encode(self, samples: Sequence[Sequence[Transform]]) -> UInt8[np.ndarray, "n L"]:
         """Messages of the same frames as CDR."""
         stamps = np.array([[each.stamp_ns for each in message] for message in samples], np.int64)
-        values = np.array([[each.values for each in message] for message in samples], np.float64)
+        values = np.array([[each.values for each in message] for message in samples], np.float64).reshape(*stamps.shape, 7)
         return encode_transforms(stamps, values, [each.frames for each in samples[0]])
 
     def cut(self, found: Messages, mask: Bool[np.ndarray, " n"]) -> Cut:

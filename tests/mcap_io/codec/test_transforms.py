@@ -10,6 +10,7 @@ import pytest
 from mcap.writer import Writer
 
 from imutool.cleaning.truth import read_truth
+from imutool.conversion.run import convert
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
@@ -62,6 +63,21 @@ def test_a_transform_is_a_pose_of_its_child_and_an_estimate_unless_it_is_named(t
     assert recording.truth.p_wb.tolist() == [[float(n), 1.0, 2.0] for n in range(COUNT)]
     assert (recording.truth.q_wb_wxyz == [1.0, 0.0, 0.0, 0.0]).all()
     assert "/tf/body (estimate) is no truth" in recording.truth_caveat
+
+
+def test_convert_writes_transforms_of_ros_also_where_a_message_lists_none(tmp_path: Path) -> None:
+    frames = [], [transform("map", "body", 5, 1.0)]
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        tf = writer.register_channel("/tf", "json", writer.register_schema("foxglove.FrameTransforms", "jsonschema", b"{}"))
+        for each in frames:
+            writer.add_message(tf, 7, json.dumps({"transforms": each}).encode(), 7)
+        writer.finish()
+    assert not convert(tmp_path / "log.mcap", tmp_path / "out.mcap").losses
+    with Log(tmp_path / "out.mcap") as log:
+        assert [log.topics[name].count for name in ("/tf", "/tf/as_recorded")] == [2, 2]
+        assert [batch.p_wb.tolist() for batch in log.pose_batches("/tf")] == [[[1.0, 1.0, 2.0]]]
 
 
 def test_info_names_the_bodies_that_are_seen_in_a_world(tmp_path: Path) -> None:
