@@ -12,7 +12,7 @@ from imutool.cleaning.samples import STEP_NS
 from imutool.errors import LogError
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec.schemas import TF
-from imutool.mcap_io.codec.transforms import bodies
+from imutool.mcap_io.codec.transforms import bodies, is_still
 from imutool.mcap_io.log import Log
 from imutool.recording import GRAVITY_M_S2, Poses, Recording, seconds
 from imutool.units import AXES
@@ -49,7 +49,7 @@ def read_truth(
 ) -> Truth | None:
     """Poses of the first readable topic of the true ones, or of `topics`; None below three.
 
-    They reach to `end_ns`. A transform of a topic is named as TOPIC/CHILD_FRAME; a topic of several is its first body.
+    They reach to `end_ns`. A transform of a topic is named as TOPIC/CHILD_FRAME; of several the first that turns counts.
     `refused` is called with each topic before it that cannot be read, and with the error.
     """
     for topic in log.truth_topics if topics is None else topics:
@@ -69,9 +69,9 @@ def read_truth(
             if refused is not None:
                 refused(topic, error)
             continue
-        for parts in (found[pair] for pair in bodies(found)[:1]):  # joints of a tree turn otherwise
-            if sum(len(part[0]) for part in parts) >= FEWEST:
-                t_ns, p_wb, q_wb_wxyz = map(np.concatenate, zip(*parts, strict=True))
+        each = [tuple(map(np.concatenate, zip(*found[pair], strict=True))) for pair in bodies(found) if found[pair]]
+        for t_ns, p_wb, q_wb_wxyz in sorted(each, key=lambda body: is_still(body[2]))[:1]:  # not joints
+            if len(t_ns) >= FEWEST:
                 return Truth(topic, t_ns, p_wb, quaternion.unit(q_wb_wxyz), log.topics[named].pose_kind)
     return None
 

@@ -15,7 +15,7 @@ from imutool.errors import LogError
 from imutool.file_location import Location, log_name
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec import messages, schemas
-from imutool.mcap_io.codec.transforms import bodies
+from imutool.mcap_io.codec.transforms import bodies, is_still
 from imutool.mcap_io.frames import read_frames
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import CLEAN_FIX, MESSAGE_POSES, SCALARS, UNIT_KEY, VELOCITY_KEY, StampCheck, check_finite
@@ -243,7 +243,8 @@ class _Columns:
         for name in (name for name in names if name not in self.left_out):
             with self._leave_out_on_error(name):
                 found[name] = self._poses(name)
-        return found
+        still = {name for name, poses in found.items() if name not in self.log.topics and is_still(poses.q_wb_wxyz)}
+        return {name: found[name] for name in sorted(found, key=still.__contains__)}  # a wall is not the IMU's body
 
     def _poses(self, name: str) -> Poses:
         with self.log.named(name):

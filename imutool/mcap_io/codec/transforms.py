@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from mcap.records import Schema
 
-from imutool.array_types import Bool, UInt8
+from imutool.array_types import Bool, Float64, UInt8
 from imutool.errors import LogError
 from imutool.mcap_io.codec.encode import encode_transforms
 from imutool.mcap_io.codec.formats import LACKS, Format, Path
@@ -30,6 +30,7 @@ FRAMES = "parent_frame_id", "child_frame_id"
 NUMBERS = *(("translation", axis) for axis in "xyz"), *(("rotation", axis) for axis in "wxyz")
 NAME = re.compile(r"(.*_)?name")  # of a body
 WORLD = re.compile(r"(.*[/_])?(map|odom|world|earth)(_combined|_frame)?")
+STILL = 0.02  # of a quaternion's numbers, 2 degrees
 STAMPS = ("seconds", "nanos"), ("sec", "nsec")
 
 
@@ -41,6 +42,11 @@ def bodies(pairs: Collection[tuple[str, str]]) -> list[tuple[str, str]]:
     children = {child for _, child in pairs}
     in_worlds = [pair for pair in pairs if pair[0] not in children or WORLD.fullmatch(pair[0])]
     return [pair for pair in in_worlds if not WORLD.fullmatch(pair[1])] or in_worlds or [*pairs]
+
+
+def is_still(q_wb_wxyz: Float64[np.ndarray, "n 4"]) -> bool:
+    """Whether a body does not turn, as a wall or a wand that lies there."""
+    return not len(q_wb_wxyz) or bool(np.ptp(q_wb_wxyz, axis=0).max() < STILL)
 
 
 class NamedPoses:

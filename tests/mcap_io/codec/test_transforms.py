@@ -65,6 +65,27 @@ def test_a_transform_is_a_pose_of_its_child_and_an_estimate_unless_it_is_named(t
     assert "/tf/body (estimate) is no truth" in recording.truth_caveat
 
 
+def test_a_body_that_turns_comes_ahead_of_a_wall(tmp_path: Path) -> None:
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channels = [
+            writer.register_channel(topic, "json", writer.register_schema(schema, "jsonschema", b"{}"))
+            for topic, schema in (("/imu", "Imu"), ("/mocap/tf", "foxglove.FrameTransforms"))
+        ]
+        for n, t in enumerate(T_NS.tolist()):
+            turned = {"x": float(np.sin(n / 99)), "y": 0.0, "z": 0.0, "w": float(np.cos(n / 99))}
+            each = [transform("map", "wall", t, 3.0), {**transform("map", "drone", t, float(n)), "rotation": turned}]
+            for channel, message in zip(channels, (imu(n), {"transforms": each}), strict=True):
+                writer.add_message(channel, t, json.dumps(message).encode(), t)
+        writer.finish()
+    assert list(read(tmp_path / "log.mcap").truths) == ["/mocap/tf/drone", "/mocap/tf/wall"]
+    with Log(tmp_path / "log.mcap") as log:
+        truth = read_truth(log)
+    assert truth is not None
+    assert truth.p_wb[1, 0] == 10.0
+
+
 def test_convert_writes_transforms_of_ros_also_where_a_message_lists_none(tmp_path: Path) -> None:
     frames = [], [transform("map", "body", 5, 1.0)]
     with (tmp_path / "log.mcap").open("wb") as file:
