@@ -8,9 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from imutool.errors import DataError
+
 from ._table_headerless import name_headerless
 from ._table_mat import check_size
 from ._table_text import WIDEST, Columns
+
+OBJECTS = "allow_pickle"  # in what NumPy says of an array of objects
 
 
 def load_npz(path: Path, columns: Columns) -> None:
@@ -22,8 +26,9 @@ def load_npz(path: Path, columns: Columns) -> None:
             check_size(path, max(info.file_size, 8 * int(np.prod(shape, dtype=float))))
         check_size(path, sum(info.file_size for info in archive.infolist()))
     with np.load(path, allow_pickle=False) as arrays:
-        for name in arrays.files:
-            _add(columns, name, arrays[name])
+        objects = [name for name in arrays.files if not _added(columns, name, arrays)]
+        if objects and len(objects) == len(arrays.files):
+            raise _of_objects(path)
 
 
 def load_npy(path: Path, columns: Columns) -> None:
@@ -48,16 +53,40 @@ def _add(columns: Columns, name: str, array: np.ndarray) -> None:
         columns.add(name, array)
 
 
+def _added(columns: Columns, name: str, arrays: Any) -> bool:
+    """Whether an array was added: one of Python's objects is none of numbers."""
+    try:
+        _add(columns, name, arrays[name])
+    except ValueError as error:
+        if OBJECTS not in str(error):
+            raise
+        return False
+    return True
+
+
+def _of_objects(path: Path) -> DataError:
+    what = "holds objects of Python, which can run any program when they are read"
+    fix = (
+        "Load it where you trust its source, save its arrays with numpy.savez(OUT, gyro=..., acc=..., t=...), and convert that"
+    )
+    return DataError(what, where=path, fix=fix)
+
+
 def read_npy(path: Path) -> np.ndarray:
     """Array of a .npy.
 
     Raises:
-        DataError: larger than a table may be.
-        ValueError: damaged, or of Python's objects.
+        DataError: larger than a table may be, or of Python's objects.
+        ValueError: damaged.
     """
     with path.open("rb") as file:
         check_size(path, 8 * int(np.prod(npy_shape(file), dtype=float)))
-    array: np.ndarray = np.load(path, allow_pickle=False)
+    try:
+        array: np.ndarray = np.load(path, allow_pickle=False)
+    except ValueError as error:
+        if OBJECTS in str(error):
+            raise _of_objects(path) from error
+        raise
     return array
 
 

@@ -61,7 +61,8 @@ class Bag:
         start = self.source.at(0, min(len(MAGIC), size))
         if start != MAGIC:
             what = "the file is empty" if not size else f"this is not a ROS 1 bag: it starts with {start!r}"
-            raise LogError(what, expected=repr(MAGIC))
+            old = "Bring it to version 2.0 with the rosbag of ROS 1: rosbag filter OLD.bag NEW.bag True"
+            raise LogError(what, expected=repr(MAGIC), fix=old if start.startswith(b"#ROSRECORD") else "")
         found = self._head(len(MAGIC))
         if found is not None and found.op == Op.BAG and found.fields.get(b"encryptor"):
             raise LogError(f"the bag is encrypted with {found.fields[b'encryptor'][:80]!r}", expected="one that is not")

@@ -12,6 +12,7 @@ from imutool.cleaning.samples import STEP_NS
 from imutool.errors import LogError
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec.schemas import TF
+from imutool.mcap_io.codec.transforms import bodies, is_still
 from imutool.mcap_io.log import Log
 from imutool.recording import GRAVITY_M_S2, Poses, Recording, seconds
 from imutool.units import AXES
@@ -48,30 +49,30 @@ def read_truth(
 ) -> Truth | None:
     """Poses of the first readable topic of the true ones, or of `topics`; None below three.
 
-    They reach to `end_ns`. A transform of a topic is named as TOPIC/CHILD_FRAME.
+    They reach to `end_ns`. A transform of a topic is named as TOPIC/CHILD_FRAME; of several the first that turns counts.
     `refused` is called with each topic before it that cannot be read, and with the error.
     """
     for topic in log.truth_topics if topics is None else topics:
-        times, places, turns = [], [], []
-        last = -(2**62)
+        found: dict[tuple[str, str], list[tuple[np.ndarray, ...]]] = {}
         named = topic if topic in log.topics else next(t.name for t in log.with_schema((TF,)) if topic.startswith(f"{t.name}/"))
+        is_tree = log.topics[named].schema_name == TF
         try:
             for batch in log.pose_batches(named, end_ns=end_ns):
-                if topic not in (named, f"{named}/{batch.child_frame_id.lstrip('/')}"):
+                parent, child = batch.frame_id.lstrip("/"), batch.child_frame_id.lstrip("/")
+                if topic not in (named, f"{named}/{child}"):
                     continue
-                keep = _thinned(batch.stamp_ns, last)
+                parts = found.setdefault((parent, child) if is_tree else ("", topic), [])
+                keep = _thinned(batch.stamp_ns, int(parts[-1][0][-1]) if parts else -(2**62))
                 if len(keep):
-                    last = int(batch.stamp_ns[keep[-1]])
-                    times.append(batch.stamp_ns[keep])
-                    places.append(batch.p_wb[keep])
-                    turns.append(batch.q_wb_wxyz[keep])
+                    parts.append((batch.stamp_ns[keep], batch.p_wb[keep], batch.q_wb_wxyz[keep]))
         except LogError as error:  # poses are a help here, not what is cleaned
             if refused is not None:
                 refused(topic, error)
             continue
-        if sum(map(len, times)) >= FEWEST:
-            q_wxyz = quaternion.unit(np.concatenate(turns))
-            return Truth(topic, np.concatenate(times), np.concatenate(places), q_wxyz, log.topics[named].pose_kind)
+        each = [tuple(map(np.concatenate, zip(*found[pair], strict=True))) for pair in bodies(found) if found[pair]]
+        for t_ns, p_wb, q_wb_wxyz in sorted(each, key=lambda body: is_still(body[2]))[:1]:  # not joints
+            if len(t_ns) >= FEWEST:
+                return Truth(topic, t_ns, p_wb, quaternion.unit(q_wb_wxyz), log.topics[named].pose_kind)
     return None
 
 

@@ -83,7 +83,10 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             turned: Body | None = None if mount is None else body_of(log, survey.pose_topic, mount.T)
             if mount is None and not comes_later:
                 turned = turned_body(log, ImuSamples(log, topic), survey.pose_topic)
-            if changes := pose_notes(survey.world, survey.quaternions, survey.position_unit, survey.pose_delay_ns, turned):
+            changes = pose_notes(survey.world, survey.quaternions, survey.position_unit, survey.pose_delay_ns, turned)
+            if changes and (poses_of := log.topics[survey.pose_topic]).reflected is not None:
+                kept.append(f"{poses_of.name} keeps its poses: only those of ROS are corrected, not {poses_of.own_schema}")
+            elif changes:
                 world, late_ns, body, pose_topic = survey.world, survey.pose_delay_ns, turned or NOT_TURNED, survey.pose_topic
                 unit, quaternions, copies = survey.position_unit, survey.quaternions, frames_of_copies(log, pose_topic)
                 frame_id = next(log.pose_batches(pose_topic)).frame_id

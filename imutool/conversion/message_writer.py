@@ -24,6 +24,7 @@ from imutool.file_location import Location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
 from imutool.mcap_io.codec.reflection import LOG_TIME, WITHOUT_STAMP, Reflected, reflect
+from imutool.mcap_io.codec.transforms import Transforms
 from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
 from imutool.mcap_io.write import (
@@ -109,7 +110,7 @@ class _Stream:
         self._buffers: dict[int, MessageBuffer] = {}  # by channel
         self._shared = MessageBuffer(packed=False), MessageBuffer(packed=False)  # of sensors, and of all others that are small
         self._sequence = Counter[int]()
-        self._reflected: dict[int, tuple[int, Reflected | Px4]] = {}  # channel of the CDR, by that of the original
+        self._reflected: dict[int, tuple[int, Reflected | Transforms | Px4]] = {}  # channel of the CDR, by that of the original
         self._has_imu = any(schemas.canonical(topic.schema_name) == schemas.IMU for topic in source.topics)
         self._begun = set[int]()  # channels that have messages
         self._made_of = set[str]()  # topics of PX4 from which another is made
@@ -122,11 +123,10 @@ class _Stream:
     def _define(self, topic: MessageTopic, first: bytes | memoryview | None = None) -> int:
         """Define a topic; an IMU or a pose in protobuf or the like becomes CDR under its name, its original gets another."""
         if first is not None and (found := _reflected(topic, bytes(first))) is not None:
-            marks = ((KIND_KEY, named_kind(topic.name, topic.schema_name)),) if found.schema_name == schemas.POSE else ()
+            marks = ((KIND_KEY, named_kind(topic.name, topic.schema_name)),) if found.schema_name != schemas.IMU else ()
             cdr = self._define(MessageTopic(topic.name, found.schema_name, "ros2msg", b"", "cdr", marks))
             recorded = (*topic.metadata, (RECORDED_KEY, topic.name))
-            number = self._define(replace(topic, name=f"{topic.name}/as_recorded", metadata=recorded))
-            self.channels[topic] = number
+            number = self.channels[topic] = self._define(replace(topic, name=f"{topic.name}/as_recorded", metadata=recorded))
             self._reflected[number] = cdr, found
             si = "rad/s and m/s^2" if found.schema_name == schemas.IMU else "metres"
             units = f"{found.units}, as the schema states" if found.units else si
@@ -205,11 +205,11 @@ class _Stream:
         except ValueError:
             self._lacking[topic.name] += 1
             return
-        self._put(channel, log_time, publish_time, reflected.encode([sample]).tobytes())
+        self._put(channel, log_time, publish_time, reflected.encode([sample]).tobytes())  # type: ignore[list-item]  # its own
 
 
-def _reflected(topic: MessageTopic, first: bytes) -> Reflected | None:
-    """Fields of an IMU or a pose in a topic of another encoding; None for the original of a translated topic.
+def _reflected(topic: MessageTopic, first: bytes) -> Reflected | Transforms | None:
+    """Fields of an IMU or poses in a topic of another encoding; None for the original of a translated topic.
 
     Raises:
         ConfigError: its messages are protobuf, which is not installed.

@@ -33,8 +33,8 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "it is an sdlog2 log of PX4 before 2017",
         "Make a CSV of it with sdlog2_dump.py of PX4, and convert that with a map of its columns",
     ),
-    rb"[#%][A-Z0-9]{4,}A,[A-Z0-9_]+,\d": (  # with a long or a short header
-        "it is an ASCII log of a NovAtel receiver, whose RAWIMU holds counts of a scale that depends on the IMU",
+    rb"[#%][A-Z0-9]{4,}A,[A-Z0-9_]+,\d|\xaa\x44[\x12\x13]": (  # with a long or a short header, as text or not
+        "it is a log of a NovAtel receiver, whose RAWIMU holds counts of a scale that depends on the IMU",
         "Make a CSV of it in rad/s and m/s^2 with the scale that NovAtel's manual states for the IMU, and convert that",
     ),
     rb"MD\xfc\x03": (
@@ -72,6 +72,34 @@ FORMATS = {  # what a file that begins like this is, and what to do
     rb"(#[^\n]*\n)*(?=([^\n]*[,;\t]){2})([^\n]*[,;\t])?['\"]?(?i:_?value)['\"]?\s*[,;\t\n]": (  # as InfluxDB and Grafana export
         "it is a long table, with a row for each number",
         "Pivot it to a row for each time and a column for each axis, as pivot() of Flux and pivot_table() of pandas do",
+    ),
+    rb"\xed\xa1\xda\x01": (
+        "it is a log of LCM, which does not hold the types of its messages",
+        "Decode it with the Python module that lcm-gen made of the types, write a CSV of the IMU, and convert that",
+    ),
+    rb"\x00{4}.{4}[\x01-\xff][\x00-\x07]\x00{6}\x08\x01": (  # a section of type 0 with less than 2 kB, then its version
+        "it is a record of Apollo (Cyber RT)",
+        "Read its channel of the IMU with cyber_record, write a CSV, and convert that",
+    ),
+    rb"#ROSRECORD V1\.": (
+        "it is a bag of ROS before 2010 (version 1)",
+        "Bring it to version 2.0 with the rosbag of ROS 1: rosbag filter OLD.bag NEW.bag True",
+    ),
+    rb"VisionRe": (
+        "it is a VRS recording, as of Project Aria",
+        "Export its IMU as CSV with projectaria_tools or pyvrs, and convert that",
+    ),
+    rb"RRF\d|RRIO": (
+        "it is a recording of Rerun, which imutool writes and does not read",
+        "Convert the log that it was made of",
+    ),
+    rb"\xd4\xc3\xb2\xa1|\xa1\xb2\xc3\xd4|\x4d\x3c\xb2\xa1|\x0a\x0d\x0d\x0a": (
+        "it is a capture of a network (pcap), as of a lidar",
+        "Replay it to the sensor's driver, record a bag of that, and convert the bag",
+    ),
+    rb"MDF {5}|UnFinMF |TDSm": (
+        "it is a measurement file (MDF or TDMS)",
+        "Export the channels of the IMU as CSV or HDF5, with asammdf or npTDMS, and convert that",
     ),
     POINTER: ("it is a pointer of Git LFS in place of the file", GET_FILES),
     ARCHIVE: (

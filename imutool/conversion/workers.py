@@ -20,7 +20,7 @@ from imutool.conversion.user_labels import Labels
 from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.file_location import first_bytes
 from imutool.mcap_io.codec import schemas
-from imutool.mcap_io.codec.joined_imu import JOIN_VECTORS
+from imutool.mcap_io.codec.joined_imu import JOIN_VECTORS, unread_fix
 from imutool.mcap_io.codec.records import MAGIC
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
@@ -192,7 +192,9 @@ def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
         return Outcome(None, _said(labelled, "skipped", "repairs"), _said(labelled, "losses"))
     write_log(labelled, job.target, compression=job.compression, overwrite=job.overwrite)
     with Log(job.target) as log:
-        joined = JOIN_VECTORS if len(log.with_schema((schemas.VECTOR3,))) > 1 else ""
+        every = {topic.message_encoding for topic in log.topics.values()}, {t.schema_encoding for t in log.topics.values()}
+        unread = f". {fix}" if (fix := unread_fix(*every)) else ""
+        joined = JOIN_VECTORS if len(log.with_schema((schemas.VECTOR3,))) > 1 else unread
         lacking = () if log.imu_topics else (f"no topic is an IMU{joined}",)
         own = {name: topic.reflected for name, topic in log.topics.items() if isinstance(topic.reflected, Reflected)}
     stated = [f"{name}: {found.units}, by the comments of its definition" for name, found in own.items() if found.units]

@@ -11,6 +11,7 @@ from imutool.array_types import Int64
 from imutool.cleaning.stamp_line import distinct
 from imutool.errors import LogError
 from imutool.log_info.report import TruthInfo
+from imutool.mcap_io.codec.transforms import bodies
 from imutool.mcap_io.log import Log
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, nanoseconds
 
@@ -18,15 +19,14 @@ logger = logging.getLogger(__name__)
 
 
 def transforms(log: Log, topic: str) -> list[tuple[str, Int64[np.ndarray, "..."]]]:
-    """Children of frames without a parent, as TOPIC/CHILD_FRAME, with their stamps."""
+    """Frames that are bodies, as TOPIC/CHILD_FRAME, with their stamps."""
     found: dict[tuple[str, str], list[Int64[np.ndarray, "..."]]] = {}
     try:
         for batch in log.pose_batches(topic):
             found.setdefault((batch.frame_id.lstrip("/"), batch.child_frame_id.lstrip("/")), []).append(batch.stamp_ns)
     except LogError as error:
         logger.warning("%s %s: %s", log.path, topic, error.what)
-    children = {child for _, child in found}
-    return [(f"{topic}/{child}", np.concatenate(stamps)) for (parent, child), stamps in found.items() if parent not in children]
+    return [(f"{topic}/{pair[1]}", np.concatenate(found[pair])) for pair in bodies(found)]
 
 
 def coverage(topic: str, kind: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Iterable[Int64[np.ndarray, "..."]]) -> TruthInfo:

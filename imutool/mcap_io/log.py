@@ -120,14 +120,15 @@ class Log:
 
     def no_imu(self) -> LogError:
         """Error of a log without an IMU."""
-        fix = no_imu_fix((topic.schema_name, topic.message_encoding) for topic in self.topics.values())
+        fix = no_imu_fix((t.schema_name, t.message_encoding, t.schema_encoding) for t in self.topics.values())
         return LogError("the log has no IMU topic", where=self.path, expected=f"{schemas.IMU} among {self.listing()}", fix=fix)
 
     @property
     def pose_topics(self) -> list[str]:
-        """Topics with poses of a body; /tf only where no other topic has poses, and never /tf_static."""
+        """Topics with poses of a body; /tf where it is the truth or no other topic has poses, and never /tf_static."""
         dedicated = [t.name for t in self.with_schema(MESSAGE_POSES) if t.pose_kind != COMMAND]
-        return dedicated or [t.name for t in self.with_schema((schemas.TF,)) if not t.name.endswith("tf_static")]
+        trees = (t for t in self.with_schema((schemas.TF,)) if not t.name.endswith("tf_static"))
+        return dedicated + [t.name for t in trees if not dedicated or t.pose_kind == "truth"]
 
     @property
     def truth_topics(self) -> list[str]:
@@ -293,8 +294,7 @@ class Log:
     def _cut(
         self, found: messages.Messages, wanted: Mapping[str, set[int]], first: int = -1, last: int = 2**63 - 1
     ) -> Iterator[tuple[str, messages.Rows]]:
-        times = found.times()
-        inside = (times >= first) & (times <= last)
+        inside = ((times := found.times()) >= first) & (times <= last)
         for topic, channels in wanted.items():
             for heads, payload in self.topics[topic].cut(found, inside & found.of_channels(channels)):
                 yield topic, messages.columns(heads, payload)

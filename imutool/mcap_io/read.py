@@ -15,18 +15,10 @@ from imutool.errors import LogError
 from imutool.file_location import Location, log_name
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec import messages, schemas
+from imutool.mcap_io.codec.transforms import bodies, is_still
 from imutool.mcap_io.frames import read_frames
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import (
-    CLEAN_FIX,
-    ENCODINGS,
-    MESSAGE_POSES,
-    SCALARS,
-    UNIT_KEY,
-    VELOCITY_KEY,
-    StampCheck,
-    check_finite,
-)
+from imutool.mcap_io.topics import CLEAN_FIX, MESSAGE_POSES, SCALARS, UNIT_KEY, VELOCITY_KEY, StampCheck, check_finite
 from imutool.mcap_io.write import own_and_user_metadata
 from imutool.processes.system import release_memory
 from imutool.recording import UNIT_QUATERNION_TOLERANCE, Imu, Poses, Recording, Scalars, unit_quaternions
@@ -94,7 +86,7 @@ def read_recordings(
     own, metadata = own_and_user_metadata(log.metadata_records(), imu_topic)
     truths = _choose_truths(log, truth)
     velocities = {t.name: t.metadata[VELOCITY_KEY] for t in log.topics.values() if VELOCITY_KEY in t.metadata}
-    numbers = [t for t in log.with_schema(SCALARS) if t.message_encoding in ENCODINGS and (derived or not t.is_derived)]
+    numbers = [t for t in log.with_schema(SCALARS) if t.is_read and (derived or not t.is_derived)]
     scalars = [t.name for t in numbers if t.name not in velocities and (vectors or SCALARS[t.schema_name] == 1)]
     used = {name: of for name, of in velocities.items() if of in truths}
     others = {t: k for t in (*log.pose_topics, *truths) if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths}
@@ -144,6 +136,7 @@ class _Columns:
     refused: Callable[[str, LogError], None] | None
     warn: Callable[..., None]
     kept: dict[str, list[tuple[np.ndarray, ...]]] = field(default_factory=dict)  # columns, by topic
+    frames: dict[str, dict[tuple[str, str], str]] = field(default_factory=dict)  # names of a tree's poses
     left_out: set[str] = field(default_factory=set)
     lost: Counter[str] = field(default_factory=Counter)  # poses that are none, by topic
     run: ClockRun = field(init=False)  # the current one of `runs`
@@ -177,7 +170,9 @@ class _Columns:
     def _take_poses(self, topic: str, rows: messages.Rows) -> None:
         tree = self.log.topics[topic].schema_name == schemas.TF
         for every in self.log.topics[topic].decode_poses(rows, lost=True):
-            name, pose = f"{topic}/{every.child_frame_id.lstrip('/')}" if tree else topic, every.tracked()
+            parent, child, pose = every.frame_id.lstrip("/"), every.child_frame_id.lstrip("/"), every.tracked()
+            name = f"{topic}/{child}" if tree else topic
+            self.frames.setdefault(topic, {})[parent, child] = name
             self.lost[name] += len(every.stamp_ns) - len(pose.stamp_ns)
             self._keep(name, pose.sequence, pose.stamp_ns, pose.p_wb, pose.q_wb_wxyz)
 
@@ -233,8 +228,9 @@ class _Columns:
     def truths(self, wanted: str | None) -> dict[str, Poses]:
         names: list[str] = []
         for topic in (name for name in self.truth_topics if name not in self.left_out):
-            tree = self.log.topics[topic].schema_name == schemas.TF
-            names += [name for name in self.kept if name.startswith(f"{topic}/")] if tree else [topic]
+            frames = self.frames.get(topic, {})
+            tree = [name for pair, name in frames.items() if wanted or pair in bodies(frames)]
+            names += tree if self.log.topics[topic].schema_name == schemas.TF else [topic]
         if wanted is not None and wanted not in self.log.topics:
             if wanted not in names:
                 expected = ", ".join(names) or "a transform"
@@ -247,7 +243,8 @@ class _Columns:
         for name in (name for name in names if name not in self.left_out):
             with self._leave_out_on_error(name):
                 found[name] = self._poses(name)
-        return found
+        still = {name for name, poses in found.items() if name not in self.log.topics and is_still(poses.q_wb_wxyz)}
+        return {name: found[name] for name in sorted(found, key=still.__contains__)}  # a wall is not the IMU's body
 
     def _poses(self, name: str) -> Poses:
         with self.log.named(name):

@@ -24,13 +24,13 @@ from imutool.mcap_io.codec.decode import (
 )
 from imutool.mcap_io.codec.joined_imu import JoinedImu, Vectors, whole_of
 from imutool.mcap_io.codec.messages import Messages, Rows
-from imutool.mcap_io.codec.reflection import Reflected, format_of, reflect, reflect_cdr
-from imutool.mcap_io.codec.transforms import TYPE, Transforms
+from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
+from imutool.mcap_io.codec.transforms import Transforms, named_poses
 from imutool.mcap_io.index import LogIndex
 from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import named_kind
 
-ENCODINGS = ("cdr", "ros1")
+ENCODINGS, DESCRIBED = ("cdr", "ros1"), {("ros2msg", "cdr"), ("ros1msg", "ros1")}
 REFLECTED = ("protobuf", "json", "flatbuffer")  # encodings whose messages are searched for those of an IMU and for poses
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
 PART_KEY = "imutool_part_of"  # channel metadata: one sensor of the IMU on that topic
@@ -231,19 +231,14 @@ def reflected_topics(
     `firsts` gives the first messages of some. Types of ROS 2 count only if no other IMU was recorded: drivers publish both.
     """
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
-    found: dict[str, Topic] = {}
+    found = {n: _as_ros(t, p) for n, t in topics.items() if (p := named_poses(definitions[n], t.message_encoding)) is not None}
     reflected = {n: t for n, t in topics.items() if t.message_encoding in REFLECTED and RECORDED_KEY not in t.metadata}
     in_json = [name for name, topic in reflected.items() if topic.message_encoding == "json"]
     texts_of = {name: definition.data if (definition := definitions[name]) else b"" for name in reflected}
     by_first = {name: reflect("json", name, topics[name].schema_name, texts_of[name], raw) for name, raw in firsts(in_json)}
     for name, topic in reflected.items():
-        schema = texts_of[name]
         try:
-            several = TYPE.fullmatch(topic.schema_name)
-            if several and (form := format_of(topic.message_encoding, topic.schema_name, schema)):
-                found[name] = _as_ros(topic, Transforms(form, bool(several[1])))
-                continue
-            message = by_first.get(name) or reflect(topic.message_encoding, name, topic.schema_name, schema, None)
+            message = by_first.get(name) or reflect(topic.message_encoding, name, topic.schema_name, texts_of[name], None)
         except ImportError:
             continue
         if message is not None:
@@ -255,9 +250,9 @@ def reflected_topics(
     odd = {n for n, t in imus.items() if not t.reflected and not all(map(ros2_definition.is_imu_of_ros, texts[n]))}
     known = any(not topic.is_derived for name, topic in imus.items() if name not in odd)
     for name, topic in topics.items():
-        described = (topic.schema_encoding, topic.message_encoding, topic.is_derived) == ("ros2msg", "cdr", False)
+        described = (topic.schema_encoding, topic.message_encoding) in DESCRIBED and not topic.is_derived
         definition = definitions[name] if described and (name in odd or not known) else None
-        imu = None if definition is None else reflect_cdr(topic.schema_name, definition.data)
+        imu = None if definition is None else reflect_cdr(topic.schema_name, definition.data, topic.message_encoding)
         if imu is not None and _have_one_layout(topic, texts[name]):
             found[name] = _as_ros(topic, imu)
         elif imu is not None or name in odd:  # whose bytes would be read in the order of another

@@ -22,12 +22,13 @@ COMMAND = "command"  # where a robot shall go: poses that are of no body
 KIND_WORDS = {  # in the names of topics
     "truth": "ground_truth|groundtruth|gt|truth|mocap|vicon|vrpn|optitrack|qualisys|natnet",
     COMMAND: "set_?points?|goals?|way_?points?|desired|planned|cmd|command(s|ed)?|target_pose",
-    "estimate": r"filter(ed)?|fused|fusion|estimat(e|ed|or|ion)|ekf|ukf|kalman|slam\d?|vio|vins|msckf|okvis|orb|lio|amcl|"
-    "ndt|rovio|svo|localization|tracked_pose|local_position|vision|zed_node",
+    "estimate": r"filter(ed)?|fused|fusion|estimat(e|ed|or|ion)|ekf|ukf|kalman|slam\d?|vio|vins|msckf|okvis|orb|lio|amcl|ndt|"
+    "rovio|svo|localization|tracked_pose|local_position|vision|zed_node",
     "odometry": "odom|odometry|wheel|wheels|encoder|encoders",
 }
 
-DOUBTFUL = ("estimate", "odometry")  # kinds of poses that no command uses unasked
+TRUE_TYPES = r"^(mocap|motion_capture)\w*/"  # of messages
+DOUBTFUL = ("estimate", "odometry", COMMAND)  # kinds of poses that no command uses unasked
 ESTIMATED = r"PoseWithCovarianceStamped$|TFMessage$|FrameTransforms?$"  # a filter states its covariance, or moves the frames
 
 
@@ -89,11 +90,13 @@ class Remarks:
 
 
 def named_kind(topic: str, schema_name: str) -> str:
-    """What poses are worth by the words of their topic's name, then by their type; `COMMAND` of those of no body."""
+    """Kind of poses by their topic's name, then by their type; `COMMAND` of those of no body."""
     words = "_".join(filter(None, re.split(r"[^a-z0-9]+", topic.lower())))
     for kind, pattern in KIND_WORDS.items():
         if re.search(rf"(^|_)({pattern})(_|$)", words):
             return kind
+    if re.search(TRUE_TYPES, schema_name):
+        return "truth"
     if re.search(r"[/.]Odometry$", f"/{schema_name}"):
         return "odometry"
     return "estimate" if re.search(ESTIMATED, schema_name) else "unknown"

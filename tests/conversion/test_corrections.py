@@ -38,6 +38,8 @@ from imutool.sensor.made_up_flight import flight
 P = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
 NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
+MakeMessages = Callable[[int, list[float], list[float]], list[bytes]]  # of a time, a position and a quaternion
+
 
 @pytest.fixture(scope="module")
 def made() -> Recording:
@@ -570,6 +572,56 @@ def test_a_drivers_json_that_is_turned_against_the_poses_keeps_its_axes(made: Re
     turn, true = (Rotation.from_quat(q.copy(), scalar_first=True) for q in (right.truth.q_wb_wxyz, made.truth.q_wb_wxyz))
     assert (turn * (true * Rotation.from_matrix(P.T)).inv()).magnitude().max() < 1e-7
     assert inspect(tmp_path / "right.mcap").warnings == []
+
+
+def in_mm(made: Recording, folder: Path, schema: tuple[str, str, bytes], encoding: str, message: MakeMessages) -> Path:
+    """Log of an IMU beside poses in mm, in messages of another type."""
+    write(replace(made, truths={}), folder / "imu.mcap")
+    with (folder / "imu.mcap").open("rb") as file, (folder / "mm.mcap").open("wb") as out:
+        writer = Writer(out)
+        writer.start()
+        poses = writer.register_channel("/mocap/tf", encoding, writer.register_schema(*schema))
+        channels: dict[str, int] = {}
+        for kind, channel, record in make_reader(file).iter_messages(topics=["/imu0"]):
+            if not channels:
+                known = writer.register_schema(kind.name, kind.encoding, kind.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, known)
+            writer.add_message(channels[channel.topic], record.log_time, record.data, record.publish_time)
+        for t_ns, p, q in zip(made.truth.t_ns.tolist(), 1e3 * made.truth.p_wb, made.truth.q_wb_wxyz, strict=True):
+            for raw in message(t_ns, p.tolist(), q.tolist()):
+                writer.add_message(poses, t_ns, raw, t_ns)
+        writer.finish()
+    return folder / "mm.mcap"
+
+
+def test_transforms_of_another_encoding_come_back_in_metres(made: Recording, tmp_path: Path) -> None:
+    def message(_: int, p: list[float], q: list[float]) -> list[bytes]:
+        place = {"translation": dict(zip("xyz", p, strict=True)), "rotation": dict(zip("wxyz", q, strict=True))}
+        frames = ("map", "body"), ("body", "wheel")
+        return [json.dumps({**place, "parent_frame_id": parent, "child_frame_id": child}).encode() for parent, child in frames]
+
+    log = in_mm(made, tmp_path, ("foxglove.FrameTransform", "jsonschema", b"{}"), "json", message)
+    convert(log, tmp_path / "fixed.mcap", fix=True)
+    np.testing.assert_allclose(read(tmp_path / "fixed.mcap").truths["/mocap/tf/body"].p_wb, made.truth.p_wb, rtol=1e-12)
+    assert inspect(tmp_path / "fixed.mcap").warnings == []
+
+
+def test_named_bodies_keep_their_unit_and_the_note_says_so(made: Recording, tmp_path: Path) -> None:
+    store, kind = get_typestore(Stores.ROS2_HUMBLE), "mocap_msgs/msg/Bodies"
+    store.register(get_types_from_msg("string name\ngeometry_msgs/Pose pose\n", "mocap_msgs/msg/Body"))
+    store.register(get_types_from_msg("mocap_msgs/Body[] bodies\n", kind))
+    types = store.types
+
+    def message(_: int, p: list[float], q: list[float]) -> list[bytes]:
+        orientation = types["geometry_msgs/msg/Quaternion"](*q[1:], q[0])
+        pose = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](*p), orientation)
+        return [bytes(store.serialize_cdr(types[kind]([types["mocap_msgs/msg/Body"]("drone", pose)]), kind))]
+
+    text = store.generate_msgdef(kind, ros_version=2)[0].encode()
+    report = convert(in_mm(made, tmp_path, (kind, "ros2msg", text), "cdr", message), tmp_path / "fixed.mcap", fix=True)
+    assert [note for note in report.notes if "/mocap/tf" in note] == [
+        f"fixed.mcap: /mocap/tf keeps its poses: only those of ROS are corrected, not {kind}"
+    ]
 
 
 def test_poses_of_which_the_other_logs_agree_on_nothing_get_no_note(tmp_path: Path) -> None:

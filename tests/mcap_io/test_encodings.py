@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,14 @@ import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imutool.diagnosis.signals.log_fields import GNSS, JOINTS, read_both
 from imutool.errors import LogError
 from imutool.file_location import to_location
 from imutool.mcap_io.fields import numeric_fields, others, read_field
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
 
 START_NS, PERIOD_NS, COUNT = 1_700_000_000_123_456_789, 20_000_000, 50
 KIND = "sensor_msgs/msg/JointState"
@@ -254,3 +256,39 @@ def test_numbers_of_an_imu_in_its_own_type_are_those_it_has(tmp_path: Path) -> N
         assert log.imu_topics == ["/imu"]
     assert read_field(path, "/imu.temp").values.tolist() == [20.0 + row for row in range(9)]
     assert set(others(path, "")) == {"/imu.gyro[0]", "/imu.temp"}
+
+
+def test_an_imu_of_its_own_type_in_ros_1_is_one(tmp_path: Path) -> None:
+    text = b"Header header\nfloat32[3] gyro\nfloat32[3] accel\n" + b"=" * 80
+    text += b"\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+    rows = [struct.pack("<4I3s6f", row, 7, row, 3, b"imu", row, 0, 0, 0, 0, 9.75) for row in range(9)]
+    recording = read(to_location(str(write(tmp_path / "imu.mcap", ("driver/Imu", "ros1msg", text), "ros1", rows, "/imu"))))
+    assert recording.imu.t_ns.tolist() == [7_000_000_000 + row for row in range(9)]
+    assert np.array_equal(recording.imu.gyro[:, 0], np.arange(9.0))
+    assert (recording.imu.accel == [0.0, 0.0, 9.75]).all()
+
+
+def test_bodies_that_a_motion_capture_names_in_one_message_are_true_poses(tmp_path: Path) -> None:
+    store, kind = get_typestore(Stores.ROS2_HUMBLE), "mocap4r2_msgs/msg/RigidBodies"
+    body = "string rigid_body_name\ngeometry_msgs/Point[] markers\ngeometry_msgs/Pose pose\n"
+    store.register(get_types_from_msg(body, "mocap4r2_msgs/msg/RigidBody"))
+    store.register(get_types_from_msg("std_msgs/Header header\nmocap4r2_msgs/RigidBody[] rigidbodies\n", kind))
+    types, rows = store.types, []
+    point, quaternion = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Quaternion"](0.5, -0.5, 0.5, 0.5)
+    for row in range(9):
+        named = [
+            (name, [point(0, 0, 0)] * (row % 3), point(row, 2, k)) for k, name in enumerate(["drone", "wand"][: 1 + row % 2])
+        ]
+        bodies = [
+            types["mocap4r2_msgs/msg/RigidBody"](name, markers, types["geometry_msgs/msg/Pose"](position, quaternion))
+            for name, markers, position in named
+        ]
+        header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](**stamp(row)), "map")
+        rows.append(bytes(store.serialize_cdr(types[kind](header, bodies), kind)))
+    text = store.generate_msgdef(kind, ros_version=2)[0].encode()
+    with Log(to_location(str(write(tmp_path / "mocap.mcap", (kind, "ros2msg", text), "cdr", rows, "/bodies")))) as log:
+        assert (log.truth_topics, log.topics["/bodies"].own_schema) == (["/bodies"], kind)
+        found = [batch for batch in log.pose_batches("/bodies") if batch.child_frame_id == "drone"]
+    assert np.concatenate([batch.stamp_ns for batch in found]).tolist() == [START_NS + row * PERIOD_NS for row in range(9)]
+    assert np.concatenate([batch.p_wb for batch in found]).tolist() == [[row, 2.0, 0.0] for row in range(9)]
+    assert all((batch.q_wb_wxyz == [0.5, 0.5, -0.5, 0.5]).all() and batch.frame_id == "map" for batch in found)

@@ -124,6 +124,12 @@ def tree(make: Make, children: list[str], count: int = 4) -> list[Message]:
     ]
 
 
+def test_transforms_that_are_the_truth_count_beside_odometry(foreign: Foreign, make: Make) -> None:
+    moved = [("/vicon/tf", *message[1:]) for message in tree(make, ["drone"])]
+    recording = read(foreign(imu_messages(make) + poses(make, "/odom", schemas.ODOMETRY) + moved + tree(make, ["base"])))
+    assert (list(recording.truths), dict(recording.other_poses)) == (["/vicon/tf/drone"], {"/odom": "odometry"})
+
+
 def test_transforms_are_an_estimate_that_is_named_by_its_child_frame(foreign: Foreign, make: Make) -> None:
     several = foreign(imu_messages(make) + tree(make, ["base", "/arm"]), name="several")
     unnamed = read(several)
@@ -435,7 +441,7 @@ def test_a_log_without_imu_lists_its_topics(foreign: Foreign, make: Make) -> Non
 
 
 @pytest.mark.parametrize("ros1", [False, True])
-def test_an_imu_whose_definition_has_another_order_is_not_read_in_that_of_ros(tmp_path: Path, make: Make, ros1: bool) -> None:
+def test_an_imu_whose_definition_has_another_order_is_read_in_its_own(tmp_path: Path, make: Make, ros1: bool) -> None:
     text = schemas.ros1_definition(schemas.IMU) if ros1 else schemas.definition(schemas.IMU)
     other = {"angular_velocity": "linear_acceleration", "linear_acceleration": "angular_velocity"}
     text = re.sub("|".join(other), lambda found: other[found[0]], text)
@@ -449,12 +455,19 @@ def test_an_imu_whose_definition_has_another_order_is_not_read_in_that_of_ros(tm
             payload = make(schemas.IMU, 1000 + n, np.array([0.0, 0.0, 9.8]), np.array([0.1, 0.2, 0.3]), ros1=ros1)
             writer.add_message(channel, 1000 + n, payload, 1000 + n)
         writer.finish()
-    if ros1:
-        with pytest.raises(LogError, match="another definition"):
-            read(path)
-    else:
-        imu = read(path).imu
-        assert (imu.gyro[0].tolist(), imu.accel[0].tolist()) == ([0.1, 0.2, 0.3], [0.0, 0.0, 9.8])
+    imu = read(path).imu
+    assert (imu.gyro[0].tolist(), imu.accel[0].tolist()) == ([0.1, 0.2, 0.3], [0.0, 0.0, 9.8])
+
+
+@pytest.mark.parametrize("encoding", ["cbor", "msgpack"])
+def test_a_log_whose_messages_are_not_searched_says_so(tmp_path: Path, encoding: str) -> None:
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_message(writer.register_channel("/imu", encoding, 0), 1, b"\xa0", 1)
+        writer.finish()
+    with pytest.raises(LogError, match=f"no IMU topic.* Messages in {encoding} are not searched for an IMU: record them as"):
+        read(tmp_path / "log.mcap")
 
 
 def test_several_imus_are_listed(foreign: Foreign, make: Make) -> None:

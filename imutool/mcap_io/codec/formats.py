@@ -1,4 +1,4 @@
-"""Messages of any encoding as nested fields: access by path, and the stamp among them."""
+"""Messages of any encoding as nested fields: access by path, the stamp and units among them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,42 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice, pairwise
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+
 from imutool.mcap_io.codec.schemas import NS_PER_S
 
 STAMP = r"timestamp|stamp|time|sensor_?time"
 CLOCK = r"((hw|hardware|device|sensor|sample|imu|host|header|capture|ts)_?)?(time|timestamp|stamp|t|ts)"
 COUNTED = {rf"{CLOCK}_?ns(ec)?": 1, rf"{CLOCK}_?us(ec)?|utime": 1000}  # stamps of one number
 SECONDS, NANOSECONDS = ("sec", "seconds", "secs"), ("nsec", "nanos", "nanosec", "nsecs", "nanoseconds")
+WORDS = {  # in the names of fields
+    "gyro": r"(angular_?velocity|gyro(scope)?|ang_?vel|rotation_?rate|angular_?rate|omega)",
+    "accel": r"(linear_?acceleration|accel(eration|erometer)?|acc|specific_?force)",
+}
+MDEG, DEG, RAD = ("mdeg/s", np.pi / 180e3), ("deg/s", np.pi / 180.0), ("rad/s", 1.0)
+MILLI_G, G, M_S2 = ("mg", 9.80665e-3), ("g", 9.80665), ("m/s^2", 1.0)
+NAMED = {  # units behind these words, with their size in SI
+    "gyro": {
+        r"_?m(illi)?_?(dps|deg(ree)?s?_?(p|per)?_?s(ec)?)": MDEG,
+        r"_?(dps|deg(ree)?s?_?(p|per)?_?s(ec)?)": DEG,
+        r"_?(rad(_?p?_?s)?|rads|si)": RAD,
+    },
+    "accel": {r"_mg|_?milli_?gs?": MILLI_G, r"_gs?": G, r"_?(m_?s_?2|mps2|si)": M_S2},
+}
+GYRO, ACCEL = (f"{WORDS[sensor]}({'|'.join(NAMED[sensor])})?" for sensor in WORDS)
+PER_S = r"[ _]?(/|\bper\b) ?s(ec(ond)?s?)?\b"
+STATED = {  # units in the comments of a definition
+    "gyro": {
+        rf"\b(m|milli)(dps\b|deg(ree)?s?{PER_S})": MDEG,
+        rf"(?<![a-z])(dps\b|deg(ree)?s?{PER_S})|°/s": DEG,
+        rf"\brad(ian)?s?{PER_S}|\brps\b": RAD,
+    },
+    "accel": {
+        r"m/s(\^|\*\*)?2|m/s²|m/s/s|\bmet(er|re)s? per sec(ond)?s?( squared|\^2|²)|\bmps2\b": M_S2,
+        r"\b(mg|milli-?g'?s?)\b": MILLI_G,
+        r"[\[(](in )?g'?s?[\])]|\bin g'?s?\b|^g'?s?$|\bunits?:? g\b": G,
+    },
+}
 DEPTH = 4  # messages within messages that are searched
 MAX_ROW = 64  # numbers of a list that are fields of their own
 DEEPEST, MAX_FIELDS = 24, 5000  # of a message's numbers: messages within messages, and fields; one can nest without end
@@ -49,9 +79,34 @@ class NumberFormat(Format, Protocol):
 def fields_of(tree: Tree, above: Path = ()) -> Iterator[tuple[Path, str, Any]]:
     """Path, name in lower case with underscores, and node of every field."""
     for name, node in tree.items():
-        yield (*above, name), re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower(), node
+        yield (*above, name), _snake(name), node
         if isinstance(node, Mapping):
             yield from fields_of(node, (*above, name))
+
+
+def _snake(name: str) -> str:
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+
+
+def without_axis(name: str, axis: str) -> str:
+    """Name of the vector of a field for one axis: `gyro_dps` for `gyro_x_dps`; else empty."""
+    found = re.fullmatch(rf"(.+?)_?{axis}|(.+)_{axis}(_.+)", name)
+    return "" if found is None else found[1] or found[2] + found[3]
+
+
+def unit_in_name(sensor: str, path: Path) -> tuple[str, float] | None:
+    """Unit in the names of a field and those around it, and its size."""
+    names = [_snake(key) for key in path if isinstance(key, str)]
+    every = [*names, *(without_axis(name, axis) for name in names for axis in "xyz")]
+    stated = (unit for pattern, unit in NAMED[sensor].items() for n in every if re.fullmatch(f"{WORDS[sensor]}({pattern})", n))
+    return next(stated, None)
+
+
+def unit_in(comments: Iterable[str], units: Mapping[str, tuple[str, float]]) -> tuple[str, float]:
+    """Unit that the nearest comment states, and its size; none and 1 where it states several."""
+    named = ([unit for pattern, unit in units.items() if re.search(pattern, text.lower())] for text in comments)
+    nearest = next(filter(None, named), [])
+    return nearest[0] if len(nearest) == 1 else ("", 1.0)
 
 
 def stamps_of(fields: Iterable[tuple[Path, str, Any]]) -> Iterator[tuple[tuple[Path, int], ...]]:
@@ -101,13 +156,25 @@ class Json:
 
     def comments(self, path: Path) -> Iterator[str]:
         """What the schema says of a field and of those around it, the nearest first."""
-        node, found = self._schema, list[str]()
+        nodes, found = self._with_referred([self._schema]), list[str]()
         for key in path:
-            inner = node.get("properties") if isinstance(node, dict) else None
-            node = inner.get(key) if isinstance(inner, dict) else None
-            texts = [node.get(name, "") for name in ("unit", "units", "description", "title")] if isinstance(node, dict) else []
+            inner = (node.get("properties") for node in nodes)
+            nodes = self._with_referred(properties.get(key) for properties in inner if isinstance(properties, dict))
+            texts = (node.get(name) for name in ("unit", "units", "description", "title") for node in nodes)
             found.append(next((text for text in texts if isinstance(text, str) and text), ""))
         yield from reversed(found)
+
+    def _with_referred(self, nodes: Iterable[Any]) -> list[dict[str, Any]]:
+        """Schemas of a field, and those that they refer to or are made of."""
+        found, waiting = list[dict[str, Any]](), [*nodes]
+        while waiting and len(found) < MAX_ROW:
+            if not isinstance(node := waiting.pop(0), dict):
+                continue
+            found.append(node)
+            if isinstance(reference := node.get("$ref"), str) and reference.startswith("#/"):
+                waiting.append(_inside(self._schema, reference[2:].split("/")))
+            waiting += [part for name in ("allOf", "anyOf", "oneOf") if isinstance(node.get(name), list) for part in node[name]]
+        return found
 
     def parse(self, raw: bytes) -> Any:
         """Value from its text.
@@ -153,6 +220,13 @@ def _numbers(value: Any, path: Path) -> Iterator[Path]:
             yield from _numbers(part, (*path, key))
     elif isinstance(value, int | float) and not isinstance(value, bool) and path:
         yield path
+
+
+def _inside(node: Any, keys: Iterable[str]) -> Any:
+    """Part of a JSON value by the names of objects in objects; None where it lacks one."""
+    for key in keys:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node
 
 
 def nested(values: Sequence[tuple[Sequence[str | int], Any]]) -> dict[str, Any]:

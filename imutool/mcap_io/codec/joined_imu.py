@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import dataclass
 from posixpath import commonpath
 from typing import NamedTuple
@@ -18,6 +18,7 @@ from imutool.mcap_io.codec.schemas import ACCELS, VECTOR3
 
 SENSOR_WORDS = r"gyro(scope)?", r"accel(erometer)?"
 JOIN_VECTORS = "; imutool debias and others read a gyro's and an accelerometer's vectors as one: --imu gyro=TOPIC,accel=TOPIC"
+READ, IDL = {"cdr", "ros1", "protobuf", "json", "flatbuffer"}, {"ros2idl", "omgidl"}  # encodings; languages of definitions
 Cut = Iterator[tuple[Shaped[np.ndarray, " n"], UInt8[np.ndarray, "n L"]]]  # heads and payloads of equal size
 
 
@@ -89,11 +90,20 @@ def choice_of(topics: Iterable[str]) -> str:
     return f"Choose one with `imu`{''.join(f', or join two: {names}' for names in joined)}"
 
 
-def no_imu_fix(topics: Iterable[tuple[str, str]]) -> str:
-    """Hint for a log without an IMU, by the types and encodings of its topics; may be empty."""
-    types, encodings = zip(*topics, strict=True) if (topics := list(topics)) else ((), ())
+def no_imu_fix(topics: Iterable[tuple[str, str, str]]) -> str:
+    """Hint for a log without an IMU, by its topics' types and both encodings; may be empty."""
+    types, encodings, languages = zip(*topics, strict=True) if (topics := list(topics)) else ((), (), ())
     if types.count(VECTOR3) > 1 or {*ACCELS} & {*types}:
         return "`imu` gyro=TOPIC,accel=TOPIC joins the vectors of a gyroscope (rad/s) and of an accelerometer (m/s²)"
     if {"px4_msgs/msg/SensorGyro", "px4_msgs/msg/VehicleImu"} & {*types}:
         return "imutool convert makes an IMU of PX4's topics"
+    if unread := unread_fix({*encodings}, {*languages}):
+        return unread
     return "An IMU in protobuf is read with: pip install 'imutool[protobuf]'" if "protobuf" in encodings else ""
+
+
+def unread_fix(encodings: Set[str], languages: Set[str]) -> str:
+    """Hint at messages and definitions in which no IMU is looked for; may be empty."""
+    unread = sorted((encodings - READ) | (languages & IDL))
+    what = f"Messages in {' and '.join(unread)} are not searched for an IMU"
+    return f"{what}: record them as messages of ROS, protobuf or JSON" if unread else ""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from itertools import islice
 from typing import Any
 
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf import descriptor_pb2, descriptor_pool, duration_pb2, message_factory, timestamp_pb2
 from google.protobuf.message import DecodeError
 
 from imutool.mcap_io.codec.formats import DEEPEST, MAX_FIELDS, MAX_ROW, Path, refuse_long
@@ -21,12 +22,18 @@ class Protobuf:
 
     @staticmethod
     def of(name: str, schema: bytes) -> Protobuf | None:
-        """Type of that name in a FileDescriptorSet; None where the schema is damaged or lacks it."""
+        """Type of that name in a FileDescriptorSet; None where the schema is damaged or lacks it.
+
+        Its files may come in any order (writers in C++ put the first one ahead of what it imports), and lack times.
+        """
         pool = descriptor_pool.DescriptorPool()
         try:
             refuse_long(schema)
-            for file in descriptor_pb2.FileDescriptorSet.FromString(schema).file:
-                pool.Add(file)
+            files = {known.DESCRIPTOR.name: known.DESCRIPTOR.serialized_pb for known in (timestamp_pb2, duration_pb2)}
+            stated = descriptor_pb2.FileDescriptorSet.FromString(schema).file
+            files |= {file.name: file.SerializeToString() for file in stated}
+            for each in TopologicalSorter({file.name: file.dependency for file in stated}).static_order():
+                pool.AddSerializedFile(files[each])
             return Protobuf(message_factory.GetMessageClass(pool.FindMessageTypeByName(name)))
         except (DecodeError, KeyError, TypeError, ValueError):
             return None

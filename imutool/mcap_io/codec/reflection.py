@@ -23,30 +23,33 @@ from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
 from imutool.mcap_io.codec.flatbuffer import FlatBuffer
-from imutool.mcap_io.codec.formats import DEPTH, MATRIX, NUMBER, TEXT, VECTOR, Format, Json, Path, Tree, fields_of, stamps_of
+from imutool.mcap_io.codec.formats import (
+    ACCEL,
+    DEPTH,
+    GYRO,
+    MATRIX,
+    NUMBER,
+    STATED,
+    TEXT,
+    VECTOR,
+    Format,
+    Json,
+    Path,
+    Tree,
+    fields_of,
+    stamps_of,
+    unit_in,
+    unit_in_name,
+    without_axis,
+)
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
 from imutool.mcap_io.codec.schemas import GYRO_COVARIANCE, IMU, POSE, runs
+from imutool.mcap_io.codec.transforms import TYPE, Transforms
 
-UNIT = r"(_?(rad(_?p?_?s)?|rads|m_?s_?2|mps2|si))?"
-GYRO = rf"(angular_?velocity|gyro(scope)?|ang_?vel|rotation_?rate|angular_?rate|omega){UNIT}"
-ACCEL = rf"(linear_?acceleration|accel(eration|erometer)?|acc|specific_?force){UNIT}"
 POSITION = r"position|pos|translation|p"
 ORIENTATION = r"orientation|rotation|quaternion|quat|attitude|q"
 POSE_TYPES = r"pose(?!s)|odom|truth|mocap|vicon|tracker"  # in the name of a type or topic: clouds and grids have poses too
 FRAME = r"frame_?id|frame"
-PER_S = r"[ _]?(/|\bper\b) ?s(ec(ond)?s?)?\b"
-STATED = {  # units in the comments of a definition, with their size in SI
-    "gyro": {
-        rf"\b(m|milli)(dps\b|deg(ree)?s?{PER_S})": ("mdeg/s", np.pi / 180e3),
-        rf"(?<![a-z])(dps\b|deg(ree)?s?{PER_S})|°/s": ("deg/s", np.pi / 180.0),
-        rf"\brad(ian)?s?{PER_S}|\brps\b": ("rad/s", 1.0),
-    },
-    "accel": {
-        r"m/s(\^|\*\*)?2|m/s²|m/s/s|\bmet(er|re)s? per sec(ond)?s?( squared|\^2|²)|\bmps2\b": ("m/s^2", 1.0),
-        r"\b(mg|milli-?g'?s?)\b": ("mg", 9.80665e-3),
-        r"[\[(](in )?g'?s?[\])]|\bin g'?s?\b|^g'?s?$|\bunits?:? g\b": ("g", 9.80665),
-    },
-}
 LOG_TIME, WITHOUT_STAMP = "log time", "as the messages state no stamp with its unit"
 
 
@@ -173,8 +176,8 @@ def _parts(stamp_ns: int, places: Sequence[tuple[Path, int]]) -> Iterator[tuple[
         yield path, count
 
 
-def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: bytes | None) -> Reflected | None:
-    """Fields of an IMU or a pose in messages of a schema; None of any other message.
+def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: bytes | None) -> Reflected | Transforms | None:
+    """Fields of an IMU, a pose or transforms in messages of a schema; None of others.
 
     JSON goes by the `first` message, protobuf and FlatBuffers by the schema.
 
@@ -182,6 +185,8 @@ def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: b
         ImportError: the schema is of protobuf, which is not installed.
     """
     form = format_of(encoding, schema_name, schema)
+    if form is not None and (several := TYPE.fullmatch(schema_name)):
+        return Transforms(form, bool(several[1]))
     try:
         tree = form and tree_of(form, first or b"")
     except ValueError:
@@ -189,7 +194,7 @@ def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: b
     if form is None or not isinstance(tree, Mapping):
         return None
     if (imu := _found(tree, form)) is not None:
-        return _in_si(imu, form) if isinstance(form, Json) else imu
+        return _in_si(imu, form)
     return _pose(tree, form) if re.search(POSE_TYPES, f"{topic} {schema_name}".lower()) else None
 
 
@@ -219,40 +224,40 @@ def tree_of(form: Any, first: bytes) -> Any:
     return form.tree(form.parse(first)) if isinstance(form, Json) else form.tree(DEPTH)
 
 
-def reflect_cdr(schema_name: str, schema: bytes) -> Reflected | None:
-    """Fields of an IMU in a `ros2msg` definition; None of any other message."""
+def reflect_cdr(schema_name: str, schema: bytes, encoding: str = "cdr") -> Reflected | None:
+    """Fields of an IMU in a definition of ROS; None of any other message."""
     try:
-        form = ros2_definition.DescribedCdr(ros2_definition.parse(schema_name, schema))
+        form = ros2_definition.DescribedCdr(ros2_definition.parse(schema_name, schema), encoding)
     except LogError:
         return None
     found = _found(form.tree(DEPTH), form)
     return None if found is None else _in_si(found, form)
 
 
-def _in_si(found: Reflected, form: ros2_definition.DescribedCdr | Json) -> Reflected:
-    """Fields of an IMU with the sizes of the units that the definition states."""
-    first = (form.comments(found.vectors[0]), STATED["gyro"]), (form.comments(found.vectors[3]), STATED["accel"])
-    stated = dict(zip(STATED, (_stated(comments, units) for comments, units in first), strict=True))
+def _in_si(found: Reflected, form: Format) -> Reflected:
+    """Fields of an IMU with the sizes of the units that their names or the definition state."""
+    comments = getattr(form, "comments", lambda _: ())
+    paths = dict(zip(STATED, (found.vectors[0], found.vectors[3]), strict=True))
+    stated = {sensor: unit_in_name(sensor, path) or unit_in(comments(path), STATED[sensor]) for sensor, path in paths.items()}
     names = ", ".join(f"{sensor} in {unit}" for sensor, (unit, _) in stated.items() if unit)
     return replace(found, sizes=(stated["gyro"][1], stated["accel"][1]), units=names)
-
-
-def _stated(comments: Iterable[str], units: Mapping[str, tuple[str, float]]) -> tuple[str, float]:
-    """Unit that the nearest comment states, and its size; no unit and 1 where none states one, or one states several."""
-    named = ([unit for pattern, unit in units.items() if re.search(pattern, text.lower())] for text in comments)
-    nearest = next(filter(None, named), [])
-    return nearest[0] if len(nearest) == 1 else ("", 1.0)
 
 
 def _found(tree: Tree, form: Format) -> Reflected | None:
     """Fields of an IMU in the tree of a message's fields."""
     fields = [*fields_of(tree)]
-    gyro, accel = (_vector(fields, pattern) for pattern in (GYRO, ACCEL))
+    parts: dict[Path, list[tuple[Path, str, Any]]] = {}
+    for field in fields:
+        parts.setdefault(field[0][:-1], []).append(field)
+    long, short = (GYRO, ACCEL), ("[gw]", "a")  # short: ax, ay, az, gx, gy, gz
+    searched = *((part, long) for part in parts.values()), (fields, long), *((part, short) for part in parts.values())
+    pairs = ((part, _vector(part, gyro), _vector(part, accel)) for part, (gyro, accel) in searched)
+    part, gyro, accel = next((pair for pair in pairs if pair[1] and pair[2]), (fields, None, None))
     if gyro is None or accel is None:
         return None
     frame = next((path for path, name, node in fields if node == TEXT and re.fullmatch(FRAME, name)), None)
     covariances = [
-        next((path for path, name, node in fields if node == MATRIX and re.fullmatch(rf"{pattern}_?covariance", name)), None)
+        next((path for path, name, node in part if node == MATRIX and re.fullmatch(rf"{pattern}_?covariance", name)), None)
         for pattern in (GYRO, ACCEL)
     ]
     stamp, *others = [*stamps_of(fields)] or [()]
@@ -284,7 +289,7 @@ def _vector(fields: Sequence[tuple[Path, str, Any]], pattern: str) -> tuple[Path
             if node == VECTOR:
                 return (*path, 0), (*path, 1), (*path, 2)
     x, y, z = (
-        next((path for path, name, node in fields if node == NUMBER and re.fullmatch(rf"{pattern}_?{axis}", name)), None)
+        next((path for path, name, node in fields if node == NUMBER and re.fullmatch(pattern, without_axis(name, axis))), None)
         for axis in "xyz"
     )
     return None if x is None or y is None or z is None else (x, y, z)

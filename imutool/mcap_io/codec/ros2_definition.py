@@ -1,9 +1,8 @@
 """Find every number in a ROS message from its definition, in one walk over its bytes.
 
-Grammar and alignment are those of ROS 2 (docs.ros.org, "About internal ROS 2 interfaces"; classic CDR: each primitive is
-aligned to its own size, counted from behind the 4-byte encapsulation). ROS 1 has neither encapsulation nor alignment.
-A log's definitions are taken for hostile: how deep they nest is bounded, and every count is checked against the bytes left, so
-that a walk costs no more than the message is long.
+Grammar and alignment are those of ROS 2 (docs.ros.org, "About internal ROS 2 interfaces"; CDR: each primitive is aligned to
+its own size, in its version 2 to four bytes at most, from behind the encapsulation). ROS 1 has neither of the two.
+A log's definitions are taken for hostile: how deep they nest is bounded, and every count is checked against the bytes left.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import Any, NamedTuple
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec.formats import DEEPEST, MAX_FIELDS
-from imutool.mcap_io.codec.schemas import IMU, ByteWalk, definition
+from imutool.mcap_io.codec.schemas import IMU, PLAIN, ByteWalk, definition
 
 NUMBERS = {
     **dict.fromkeys(("bool", "byte", "char", "uint8"), "u1"),
@@ -178,7 +177,7 @@ class Walk(ByteWalk):
     def __init__(self, payload: bytes, definition: Definition, encoding: str = "cdr") -> None:
         super().__init__(encoding, payload)
         if not self.ros1 and len(payload) < self.start:
-            raise LogError(f"payload starts with {payload.hex(' ')}", expected="plain CDR: 00 00 or 00 01")
+            raise LogError(f"payload starts with {payload.hex(' ')}", expected=PLAIN)
         self.definition = definition
         self.texts: list[tuple[str, int, bytes]] = []
 
@@ -195,6 +194,8 @@ class Walk(ByteWalk):
 
     def _field(self, field: Field, path: str) -> Iterator[Leaf]:
         count = field.length
+        if count is not None and field.kind not in NUMBERS:
+            self.delimiter()
         if count == 0:
             count = self.word()
         if field.kind in NUMBERS:
@@ -229,8 +230,8 @@ class Walk(ByteWalk):
 class DescribedCdr:
     """Messages of one type. They are read only: new ones have a type of ROS."""
 
-    def __init__(self, definition: Definition) -> None:
-        self._definition = definition
+    def __init__(self, definition: Definition, encoding: str = "cdr") -> None:
+        self._definition, self._encoding = definition, encoding
         self._size, self._constants = -1, list[tuple[int, bytes]]()
         self._places: dict[str, tuple[int, str]] = {}
 
@@ -272,7 +273,7 @@ class DescribedCdr:
     def _walk(self, raw: bytes) -> None:
         self._size, places = -1, dict[str, tuple[int, str]]()
         try:
-            walk = Walk(raw, self._definition)
+            walk = Walk(raw, self._definition, self._encoding)
             for leaf in walk.leaves():
                 size, form = int(leaf.kind[1]), walk.order + FORMATS[leaf.kind]
                 if leaf.length is None:
@@ -281,8 +282,7 @@ class DescribedCdr:
                     places[f"{leaf.path}[{number}]"] = leaf.offset + size * number, form
         except LogError as error:
             raise ValueError(error.what) from error
-        self._places = places
-        self._size, self._constants = len(raw), walk.constants
+        self._places, self._size, self._constants = places, len(raw), walk.constants
 
     def at(self, message: Message, path: Sequence[str | int]) -> Any:
         """Value of a number."""

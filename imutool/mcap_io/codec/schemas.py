@@ -3,11 +3,13 @@
 A message is walked once, field by field, to find where its numbers lie (a `Layout`); every further message with the same
 texts lies the same way, so whole columns are then cut out of a byte matrix (`decode`), or written into one (`encode`). Two
 encodings are known: `cdr` as ROS 2 writes it (a 4-byte encapsulation, then fields aligned to their own size; both byte orders
-are read, little endian is written) and `ros1` (no encapsulation, no alignment, a sequence number ahead of the stamp).
+and plain CDR 2 are read, little endian is written) and `ros1` (no encapsulation, no alignment, a sequence number ahead of the
+stamp).
 """
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -36,6 +38,8 @@ ACCELS = "geometry_msgs/msg/AccelStamped", "geometry_msgs/msg/AccelWithCovarianc
 MESSAGE_TWISTS = {TWIST_STAMPED: "twist", TWIST: "twist.twist", ODOMETRY: "twist.twist"}  # the twist's field
 
 NS_PER_S = 1_000_000_000
+PLAIN = "plain CDR: 00 00, 00 01, 00 06 or 00 07"
+DDS_NAME = re.compile(r"(\w+)::msg::(?:dds_::)?(\w+?)_?")
 Found = TypeVar("Found")  # what is known of a stretch of messages
 
 _FIELDS = {
@@ -101,7 +105,9 @@ def ros1_definition(schema_name: str) -> str:
 
 @cache
 def canonical(schema_name: str) -> str:
-    """ROS 2 spelling of a schema's name: `sensor_msgs/msg/Imu` for `sensor_msgs/Imu`."""
+    """ROS 2 spelling of a name: of `sensor_msgs/Imu` and `sensor_msgs::msg::dds_::Imu_`."""
+    if dds := DDS_NAME.fullmatch(schema_name):
+        return f"{dds[1]}/msg/{dds[2]}"
     package, slash, name = schema_name.partition("/")
     return f"{package}/msg/{name}" if slash and "/" not in name else schema_name
 
@@ -159,14 +165,14 @@ class ByteWalk:
 
     def __init__(self, encoding: str, message: bytes | None) -> None:
         self.message, self.ros1 = message, encoding == "ros1"
-        self.order, self.start = "<", 0
+        self.order, self.start, self.is_second = "<", 0, False
         self.constants: list[tuple[int, bytes]] = []
         if encoding == "cdr":
             self.start = 4
             head = b"\0\1\0\0" if message is None else message[:4]
-            if head[:2] not in (b"\0\0", b"\0\1"):
-                raise LogError(f"payload starts with {head.hex(' ')}", expected="plain CDR: 00 00 or 00 01")
-            self.order = "<" if head[1] else ">"
+            if head[:2] not in (b"\0\0", b"\0\1", b"\0\6", b"\0\7"):
+                raise LogError(f"payload starts with {head.hex(' ')}", expected=PLAIN)
+            self.order, self.is_second = "<" if head[1] & 1 else ">", head[1] > 1
             self.constants.append((0, head[:2]))
         elif encoding != "ros1":
             raise LogError(f"message encoding {encoding!r} is not known", expected="cdr or ros1")
@@ -175,7 +181,13 @@ class ByteWalk:
     def align(self, size: int) -> None:
         """Move to the next place of a field of this size."""
         if not self.ros1:
-            self.position += -(self.position - self.start) % size
+            self.position += -(self.position - self.start) % (min(size, 4) if self.is_second else size)
+
+    def delimiter(self) -> None:
+        """Move behind the size of a list of texts or messages, which CDR has in its version 2."""
+        if self.is_second:
+            self.align(4)
+            self.skip(4)
 
     def skip(self, size: int) -> int:
         """Move behind a field; return its place."""
@@ -223,6 +235,7 @@ def layout_of(
     numbers: list[tuple[int, int]] = []
     data: tuple[int, int] | None = None
     if shape[0] == "count":
+        walk.delimiter()
         shape, count = shape[1:], walk.word(len(texts) // 2)
     for _ in range(count):
         for part in shape:

@@ -1,26 +1,104 @@
-"""Foxglove's `FrameTransform` and `FrameTransforms` as TFMessage in CDR."""
+"""Foxglove's `FrameTransform(s)` as TFMessage in CDR, and the bodies of a tree of frames."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+import struct
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from itertools import groupby
+from functools import reduce
+from itertools import count, groupby, takewhile
+from operator import getitem
 from typing import Any, NamedTuple
 
 import numpy as np
+from mcap.records import Schema
 
-from imutool.array_types import Bool
+from imutool.array_types import Bool, Float64, UInt8
+from imutool.errors import LogError
 from imutool.mcap_io.codec.encode import encode_transforms
-from imutool.mcap_io.codec.formats import LACKS, Format
+from imutool.mcap_io.codec.formats import LACKS, Format, Path
 from imutool.mcap_io.codec.joined_imu import Cut
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
+from imutool.mcap_io.codec.ros2_definition import FORMATS, TEXT, Definition, Walk, parse
 from imutool.mcap_io.codec.schemas import NS_PER_S, TF
+from imutool.recording.message_log import TRUE_TYPES
 
 TYPE = re.compile(r"(?:.*[./])?FrameTransform(s?)")
 FRAMES = "parent_frame_id", "child_frame_id"
 NUMBERS = *(("translation", axis) for axis in "xyz"), *(("rotation", axis) for axis in "wxyz")
+NAME = re.compile(r"(.*_)?name")  # of a body
+WORLD = re.compile(r"(.*[/_])?(map|odom|world|earth)(_combined|_frame)?")
+STILL = 0.02  # of a quaternion's numbers, 2 degrees
 STAMPS = ("seconds", "nanos"), ("sec", "nsec")
+
+
+def bodies(pairs: Collection[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Parents and children of a tree whose poses are those of a body in a world.
+
+    Worlds are frames without a parent, and `map` and `odom` (REP 105): joints move in a body.
+    """
+    children = {child for _, child in pairs}
+    in_worlds = [pair for pair in pairs if pair[0] not in children or WORLD.fullmatch(pair[0])]
+    return [pair for pair in in_worlds if not WORLD.fullmatch(pair[1])] or in_worlds or [*pairs]
+
+
+def is_still(q_wb_wxyz: Float64[np.ndarray, "n 4"]) -> bool:
+    """Whether a body does not turn, as a wall or a wand that lies there."""
+    return not len(q_wb_wxyz) or bool(np.ptp(q_wb_wxyz, axis=0).max() < STILL)
+
+
+class NamedPoses:
+    """Messages of ROS with a list of named poses, read as transforms."""
+
+    def __init__(self, definition: Definition, encoding: str, names: tuple[str, str, str]) -> None:
+        self._definition, self._encoding, self._names = definition, encoding, names
+
+    def parse(self, raw: bytes) -> dict[str, Any]:
+        """Message as nested fields.
+
+        Raises:
+            ValueError: the bytes are no such message.
+        """
+        listed, name, pose = self._names
+        try:
+            walk = Walk(raw, self._definition, self._encoding)
+            numbers = {
+                leaf.path: struct.unpack_from(walk.order + FORMATS[leaf.kind], raw, leaf.offset)[0] for leaf in walk.leaves()
+            }
+        except LogError as error:
+            raise ValueError(error.what) from error
+        texts = {path: text.removesuffix(b"\0").decode(errors="replace") for path, _, text in walk.texts}
+        head: dict[str, Any] = {"parent_frame_id": texts.get("header.frame_id", "")}
+        if "header.stamp.sec" in numbers:
+            head["timestamp"] = {"sec": numbers["header.stamp.sec"], "nsec": numbers["header.stamp.nanosec"]}
+        found = []
+        for k in takewhile(lambda k: f"{listed}[{k}].{name}" in texts, count()):
+            at = f"{listed}[{k}]"
+            vectors = (("translation", "position", "xyz"), ("rotation", "orientation", "xyzw"))
+            parts = {to: {axis: numbers[f"{at}.{pose}.{of}.{axis}"] for axis in axes} for to, of, axes in vectors}
+            found.append({**head, "child_frame_id": texts[f"{at}.{name}"], **parts})
+        return {"transforms": found}
+
+    def at(self, message: Any, path: Path) -> Any:
+        """Value of a field; KeyError where the message lacks it."""
+        return reduce(getitem, path, message)
+
+
+def named_poses(schema: Schema | None, encoding: str) -> Transforms | None:
+    """Poses of the bodies that a motion capture names in one message; None of any other type."""
+    if schema is None or schema.encoding not in ("ros1msg", "ros2msg") or not re.search(TRUE_TYPES, schema.name):
+        return None
+    with suppress(LogError):
+        definition = parse(schema.name, schema.data)
+        for field in definition[definition[""][0].kind]:
+            inner = definition.get(field.kind, ()) if field.length is not None else ()
+            name = next((part.name for part in inner if part.kind == TEXT and NAME.fullmatch(part.name)), None)
+            pose = next((part.name for part in inner if (part.kind, part.length) == ("geometry_msgs/Pose", None)), None)
+            if name and pose:
+                return Transforms(NamedPoses(definition, encoding, (field.name, name, pose)), several=True)
+    return None
 
 
 class Transform(NamedTuple):
@@ -35,9 +113,29 @@ class Transform(NamedTuple):
 class Transforms:
     """Messages of one or several transforms; one that lacks a field is left out."""
 
-    format: Format
+    format: Format | NamedPoses
     several: bool
     schema_name: str = TF
+    units: str = ""  # that the schema states
+    stamp: bool = True  # or the log time in each that has none
+
+    def sample(self, raw: bytes, log_time: int) -> list[Transform]:
+        """Transforms of a message, which may list none.
+
+        Raises:
+            ValueError: they lack a field.
+        """
+        found = self._transforms(raw, log_time)
+        with suppress(*LACKS):
+            if found or (self.several and not len(self.format.at(self.format.parse(raw), ("transforms",)))):
+                return found
+        raise ValueError("no transform in the message")
+
+    def encode(self, samples: Sequence[Sequence[Transform]]) -> UInt8[np.ndarray, "n L"]:
+        """Messages of the same frames as CDR."""
+        stamps = np.array([[each.stamp_ns for each in message] for message in samples], np.int64)
+        values = np.array([[each.values for each in message] for message in samples], np.float64).reshape(*stamps.shape, 7)
+        return encode_transforms(stamps, values, [each.frames for each in samples[0]])
 
     def cut(self, found: Messages, mask: Bool[np.ndarray, " n"]) -> Cut:
         """Heads of the chosen messages, and their transforms as CDR, per stretch of the same frames."""
@@ -51,9 +149,7 @@ class Transforms:
         for frames, group in groupby(read, key=lambda entry: [transform.frames for transform in entry[1]]):
             rows, messages = zip(*group, strict=True)
             if frames:
-                stamps = np.array([[each.stamp_ns for each in message] for message in messages], np.int64)
-                values = np.array([[each.values for each in message] for message in messages], np.float64)
-                yield heads[list(rows)], encode_transforms(stamps, values, frames)
+                yield heads[list(rows)], self.encode(messages)
 
     def _transforms(self, raw: bytes, log_time: int) -> list[Transform]:
         try:

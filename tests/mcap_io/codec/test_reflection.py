@@ -1,4 +1,4 @@
-"""Units of an IMU's rates and accelerations that the comments of a ROS definition state."""
+"""IMUs in messages of other types, and the units that their definitions state."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import struct
 
 import numpy as np
 import pytest
+from google.protobuf import descriptor_pb2, timestamp_pb2
 
 from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
 
@@ -37,6 +38,16 @@ def fields(gyro: str, accel: str, above: str = "") -> str:
         (fields("", "", above="# angular rate (dps)\n\n"), 1.0, 1.0),
         (fields(" # rad/s, not deg/s", " # x axis of the gyro"), 1.0, 1.0),
         ("float64[3] gyro  # deg/sec\nfloat64[3] accel  # (g)\n", DEG, G),
+        ("float64[3] gyro_dps\nfloat64[3] acc_mg\n", DEG, 1e-3 * G),
+        (
+            "".join(
+                f"float64 {name}\n" for name in ("gyroX_deg_s", "gyroY_deg_s", "gyroZ_deg_s", "accX_g", "accY_g", "accZ_g")
+            ),
+            DEG,
+            G,
+        ),
+        ("float64[3] angular_velocity_rad_s  # as deg/s on the display\nfloat64[3] accel_mps2\n", 1.0, 1.0),
+        ("".join(f"float64 {name}\n" for name in ("gx", "gy", "gz", "ax", "ay", "az")), 1.0, 1.0),
         ("Vec gyro # °/s\nVec accel\n" + "=" * 80 + "\nMSG: my_driver/Vec\nfloat64 x\nfloat64 y\nfloat64 z\n", DEG, 1.0),
     ],
 )
@@ -51,6 +62,28 @@ def test_a_correction_is_written_in_the_unit_of_the_message() -> None:
     np.testing.assert_allclose(struct.unpack("<6d", turned[4:]), np.multiply(VALUES, [1, -1, -1, 1, -1, -1]), rtol=1e-12)
 
 
+def test_parts_of_a_json_schema_state_units_where_a_field_refers_to_them() -> None:
+    vector = {"type": "object", "title": "Vector"}
+    parts = {
+        "Rate": {"allOf": [vector, {"description": "deg/s"}]},
+        "Force": {**vector, "unit": "g"},
+        "Loop": {"$ref": "#/$defs/Loop"},
+    }
+    fields = {"gyro": {"$ref": "#/$defs/Rate"}, "accel": {"anyOf": [{"$ref": "#/$defs/Loop"}, {"$ref": "#/$defs/Force"}]}}
+    raw = json.dumps({name: dict(zip("xyz", [1, 2, 3], strict=True)) for name in fields}).encode()
+    found = reflect("json", "/imu", "Imu", json.dumps({"properties": fields, "$defs": parts}).encode(), raw)
+    assert found is not None
+    assert found.sizes == (DEG, G)
+
+
+@pytest.mark.parametrize("part", [{"linear_acceleration": [7, 8, 9]}, {"left": {"accel": [7, 8, 9]}}, {"gyro": [7, 8, 9]}])
+def test_gyro_and_accelerometer_are_those_beside_each_other(part: dict[str, object]) -> None:
+    raw = json.dumps({**part, "imu": {"accel": [1, 2, 3], "gyro": [4, 5, 6]}}).encode()
+    found = reflect("json", "/state", "", b"", raw)
+    assert found is not None
+    assert found.sample(raw, 0).values == [4, 5, 6, 1, 2, 3]
+
+
 @pytest.mark.parametrize("key", ["description", "unit"])
 def test_the_units_in_a_json_schema_count_both_ways(key: str) -> None:
     schema = {"properties": {"gyro": {"type": "object", key: "deg/s"}, "accel": {"type": "array", key: "g"}}}
@@ -61,3 +94,19 @@ def test_the_units_in_a_json_schema_count_both_ways(key: str) -> None:
     np.testing.assert_allclose(sample.values, VALUES * np.repeat([DEG, G], 3), rtol=1e-12)
     again = json.loads(found.from_cdr(found.encode([sample]))[0])
     np.testing.assert_allclose([*again["gyro"].values(), *again["accel"]], VALUES, rtol=1e-12)
+
+
+@pytest.mark.parametrize("order", ["as imported", "imported last", "not imported"])
+def test_the_files_of_a_protobuf_schema_come_in_any_order(order: str) -> None:
+    time = descriptor_pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(time)
+    own = descriptor_pb2.FileDescriptorProto(name="imu.proto", package="my", syntax="proto3", dependency=[time.name])
+    imu = own.message_type.add(name="Imu")
+    imu.field.add(name="stamp", number=1, label=1, type=11, type_name=".google.protobuf.Timestamp")
+    imu.field.add(name="gyro", number=2, label=3, type=1)
+    imu.field.add(name="accel", number=3, label=3, type=1)
+    files = {"as imported": [time, own], "imported last": [own, time], "not imported": [own]}[order]
+    found = reflect("protobuf", "/imu", "my.Imu", descriptor_pb2.FileDescriptorSet(file=files).SerializeToString(), None)
+    assert found is not None
+    raw = b"\x0a\x04\x08\x07\x10\x05" + b"".join(bytes([tag, 24]) + struct.pack("<3d", 1, 2, 3) for tag in (0x12, 0x1A))
+    assert found.sample(raw, 0) == (7_000_000_005, "", [1, 2, 3, 1, 2, 3])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 
 import numpy as np
@@ -13,6 +14,7 @@ from imutool.errors import DataError, LogError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_image, decode_imu, decode_poses, decode_scalars
 from imutool.mcap_io.codec.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
+from imutool.mcap_io.codec.ros2_definition import Walk, parse
 
 STAMPS = np.array([0, 1, 999_999_999, 1_000_000_000, 1_403_638_128_245_096_960, 2**31 * 10**9 - 1])
 COUNT = len(STAMPS)
@@ -72,6 +74,38 @@ def test_imu_without_covariance_says_unknown() -> None:
     message = ROS2.deserialize_cdr(encode_imu(STAMPS, columns(3), columns(3), "b")[0].tobytes(), schemas.IMU)
     assert not message.angular_velocity_covariance.any()
     assert not message.linear_acceleration_covariance.any()
+
+
+def second(order: str, *parts: object) -> np.ndarray:
+    """Message in plain CDR 2: doubles lie at multiples of four bytes."""
+    body = b""
+    for part in parts:
+        body += bytes(-len(body) % 4)
+        if isinstance(part, str):
+            body += struct.pack(order + "I", len(part) + 1) + part.encode() + b"\0"
+        else:
+            kind = np.dtype(order + ("f8" if isinstance(part, float) else "i4"))
+            body += np.array(part, kind).tobytes()
+    return matrix([bytes([0, 7 if order == "<" else 6, 0, 0]) + body])
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("frame_id", ["b", "imu", "abcdefg"])
+def test_the_second_version_of_cdr_is_read(order: str, frame_id: str) -> None:
+    imu = decode_imu(second(order, 7, 5, frame_id, *map(float, range(37))))
+    assert (imu.stamp_ns[0], imu.frame_id) == (7_000_000_005, frame_id)
+    assert (imu.gyro.tolist(), imu.accel.tolist()) == ([[13.0, 14.0, 15.0]], [[25.0, 26.0, 27.0]])
+    tree = second(order, 99, 1, 7, 5, frame_id, "body", *map(float, range(7)))  # the list's bytes, then its count
+    (pose,) = decode_poses(tree, schemas.TF)
+    assert (pose.child_frame_id, pose.p_wb.tolist()) == ("body", [[0.0, 1.0, 2.0]])
+    text = schemas.definition(schemas.TF).encode()
+    leaves = [leaf.path for leaf in Walk(tree[0].tobytes(), parse(schemas.TF, text)).leaves()]
+    assert leaves[-1] == "transforms[0].transform.rotation.w"
+
+
+@pytest.mark.parametrize("name", ["sensor_msgs/Imu", "sensor_msgs::msg::dds_::Imu_", "sensor_msgs::msg::Imu", schemas.IMU])
+def test_a_type_has_one_name_however_it_is_spelt(name: str) -> None:
+    assert schemas.canonical(name) == schemas.IMU
 
 
 @pytest.mark.parametrize("frame_id", FRAMES)

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
+from imutool.cleaning.truth import read_truth
+from imutool.conversion.run import convert
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
@@ -28,7 +30,10 @@ def imu(n: int) -> dict[str, object]:
     return {"angular_velocity": {"x": 0.1, "y": 0.0, "z": 0.0}, "linear_acceleration": {"x": 0.0, "y": 0.0, "z": 9.81}}
 
 
-def write(path: Path, several: bool) -> Path:
+Frames = tuple[tuple[str, str], ...]
+
+
+def write(path: Path, several: bool, topic: str = "/tf", frames: Frames = (("world", "body"), ("body", "camera"))) -> Path:
     """Log of a body and of a camera on it, in one topic."""
     name = "foxglove.FrameTransforms" if several else "foxglove.FrameTransform"
     with path.open("wb") as file:
@@ -36,10 +41,10 @@ def write(path: Path, several: bool) -> Path:
         writer.start()
         channels = [
             writer.register_channel(topic, "json", writer.register_schema(schema, "jsonschema", b"{}"))
-            for topic, schema in (("/imu", "Imu"), ("/tf", name))
+            for topic, schema in (("/imu", "Imu"), (topic, name))
         ]
         for n, t in enumerate(T_NS.tolist()):
-            each = [transform("world", "body", t, float(n)), transform("body", "camera", t, 0.5)]
+            each = [transform(*pair, t, float(n) if pair[1] == "body" else 0.5) for pair in frames]
             messages = [imu(n), *([{"transforms": each}] if several else each)]
             for channel, message in zip([channels[0]] + [channels[1]] * 2, messages, strict=False):
                 writer.add_message(channel, t, json.dumps(message).encode(), t)
@@ -60,6 +65,56 @@ def test_a_transform_is_a_pose_of_its_child_and_an_estimate_unless_it_is_named(t
     assert "/tf/body (estimate) is no truth" in recording.truth_caveat
 
 
+def test_a_body_that_turns_comes_ahead_of_a_wall(tmp_path: Path) -> None:
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channels = [
+            writer.register_channel(topic, "json", writer.register_schema(schema, "jsonschema", b"{}"))
+            for topic, schema in (("/imu", "Imu"), ("/mocap/tf", "foxglove.FrameTransforms"))
+        ]
+        for n, t in enumerate(T_NS.tolist()):
+            turned = {"x": float(np.sin(n / 99)), "y": 0.0, "z": 0.0, "w": float(np.cos(n / 99))}
+            each = [transform("map", "wall", t, 3.0), {**transform("map", "drone", t, float(n)), "rotation": turned}]
+            for channel, message in zip(channels, (imu(n), {"transforms": each}), strict=True):
+                writer.add_message(channel, t, json.dumps(message).encode(), t)
+        writer.finish()
+    assert list(read(tmp_path / "log.mcap").truths) == ["/mocap/tf/drone", "/mocap/tf/wall"]
+    with Log(tmp_path / "log.mcap") as log:
+        truth = read_truth(log)
+    assert truth is not None
+    assert truth.p_wb[1, 0] == 10.0
+
+
+def test_convert_writes_transforms_of_ros_also_where_a_message_lists_none(tmp_path: Path) -> None:
+    frames = [], [transform("map", "body", 5, 1.0)]
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        tf = writer.register_channel("/tf", "json", writer.register_schema("foxglove.FrameTransforms", "jsonschema", b"{}"))
+        for each in frames:
+            writer.add_message(tf, 7, json.dumps({"transforms": each}).encode(), 7)
+        writer.finish()
+    assert not convert(tmp_path / "log.mcap", tmp_path / "out.mcap").losses
+    with Log(tmp_path / "out.mcap") as log:
+        assert [log.topics[name].count for name in ("/tf", "/tf/as_recorded")] == [2, 2]
+        assert [batch.p_wb.tolist() for batch in log.pose_batches("/tf")] == [[[1.0, 1.0, 2.0]]]
+
+
 def test_info_names_the_bodies_that_are_seen_in_a_world(tmp_path: Path) -> None:
     (pose,) = inspect(write(tmp_path / "log.mcap", True)).truth
     assert (pose.topic, pose.poses, pose.kind) == ("/tf/body", COUNT, "estimate")
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [(("body", "wheel"), ("world", "body")), (("map", "odom"), ("odom", "body")), (("a/odom", "body"), ("body", "a/odom"))],
+)
+def test_joints_and_worlds_of_a_tree_are_no_bodies(tmp_path: Path, frames: Frames) -> None:
+    path = write(tmp_path / "log.mcap", True, "/mocap/tf", frames)
+    assert list(read(path).truths) == ["/mocap/tf/body"]
+    assert [pose.topic for pose in inspect(path).truth] == ["/mocap/tf/body"]
+    with Log(path) as log:
+        truth = read_truth(log)
+    assert truth is not None
+    assert truth.p_wb[:, 0].tolist() == [0.0, 10.0, 20.0, 30.0]
