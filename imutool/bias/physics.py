@@ -140,7 +140,7 @@ def load(path: Path, rate_hz: float) -> Model:
     if file.conventions:
         found = ", ".join(file.conventions)
         logger.warning("%s holds for a log in the units and axes of its simulation; the recording had others: %s", path, found)
-    if any(entry.name == MOUNT for entry in file.effect):
+    if any(entry.name == MOUNT and T_STEP.name not in entry.parameters for entry in file.effect):
         logger.warning("%s: mount_rotation is inverted: corrected samples are in the body's axes, not the sensor's", path)
     model = Model(parts, file.bias, rate_hz)
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()

@@ -105,7 +105,8 @@ def _converter_output(samples: Float64[np.ndarray, "n k"], findings: Sequence[Fi
     for k, sensor in enumerate(SENSORS):
         part, limit, lsb = slice(3 * k, 3 * k + 3), values.get(f"{sensor}_limit"), values.get(f"{sensor}_lsb")
         own = [values.get(f"{sensor}_limit_{axis}", np.inf if limit is None else limit) for axis in AXES]
-        out[:, part] = np.clip(out[:, part], -np.array(own), own)
+        if np.isfinite(own).any():  # else the columns may be those of another signal
+            out[:, part] = np.clip(out[:, part], -np.array(own), own)
         if lsb is not None:
             out[:, part] = lsb * np.rint(out[:, part] / lsb)
     return out

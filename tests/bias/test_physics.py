@@ -172,6 +172,14 @@ def test_what_cannot_be_taken_off_is_told(trajectory: Path, caplog: pytest.LogCa
     assert "body's axes" in caplog.text
 
 
+def test_a_mount_that_slips_is_not_said_to_be_inverted(trajectory: Path, caplog: pytest.LogCaptureFixture) -> None:
+    slips = entry("mount_rotation", {"phi_x": 0.1, "t_step": 20.0})
+    with caplog.at_level(logging.WARNING):
+        find_model(written(trajectory.with_name("slips.toml"), slips, entry("gyro_scale", {"x": 0.1})), RATE_HZ)
+    assert "stay in the samples: mount_rotation" in caplog.text
+    assert "body's axes" not in caplog.text
+
+
 def test_nothing_to_take_off_is_refused(trajectory: Path) -> None:
     file = written(trajectory.with_name("none.toml"), entry("saturation", {"gyro_limit": 5.0}), bias=None)
     with pytest.raises(ModelError, match=r"no effect can be corrected \(saturation\)"):

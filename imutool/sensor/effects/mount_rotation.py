@@ -15,6 +15,7 @@ from imutool.sensor.samples import IdealMotion, SensorSamples, Vectors
 
 NOTHING_MOVES = 1e-9  # rad/s or m/s², below which a sensor says nothing
 NEAR_RAD = 0.3  # up to which a fit that begins without a rotation finds it
+NO_ERROR = 1e-12  # of the squares of a reading: an axis that is no measurement has none
 MAX = 0.5  # of the squares, that may be left: between noise and noise every rotation leaves as much
 
 
@@ -74,7 +75,8 @@ def _slips(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
         by_phi = np.stack([np.cross(v, axis) for axis in np.eye(3)], axis=2)
         rest = error - basis @ (basis.T @ error)
         for columns, own in zip(by_phi.transpose(1, 0, 2), rest.T, strict=True):
-            weight = 1.0 / max(float((own**2).mean()), np.finfo(np.float64).tiny)
+            square, size = float((own**2).mean()), float((v**2).mean())
+            weight = 1.0 / square if square > NO_ERROR * size else 0.0
             shared = np.stack([from_on(basis * x[:, None]) for x in columns.T], axis=1)
             N += weight * (from_on(columns[:, :, None] * columns[:, None]) - shared @ shared.transpose(0, 2, 1))
             g += weight * from_on(columns * own[:, None])
