@@ -67,7 +67,7 @@ class FrameCounts(Counter[str]):
         return [f"the messages name {len(named)} frames: {some}; several sensors have no common bias"]
 
     def mixed(self) -> str:
-        """Reason not to use samples of sensors that take turns; empty where one sensor may have had several names."""
+        """Reason to distrust a topic on which sensors take turns; empty for one sensor."""
         named = sorted(frame for frame in self if frame)
         takes_turns = 2 <= len(named) <= MAX_FRAMES and self.changes > max(FEW_CHANGES, self.total() * MAX_CHANGES)
         return f"{len(named)} sensors take turns on the topic ({', '.join(named)})" if takes_turns else ""
