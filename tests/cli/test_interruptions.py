@@ -468,7 +468,8 @@ def test_the_copy_of_a_damaged_log_is_a_partial_file_of_the_target(tmp_path: Pat
     os.truncate(tmp_path / "in.mcap", (tmp_path / "in.mcap").stat().st_size // 2)
     with repaired(tmp_path / "in.mcap", tmp_path / "out.mcap", None) as saved:
         assert saved is not None
-        assert isinstance(copy := saved[0], Path)
+        copy, _ = saved
+        assert isinstance(copy, Path)
         for partial in (copy, temporary_path(copy)):  # when complete, and while it is written
             found = PARTIAL.fullmatch(partial.name)
             assert found is not None
