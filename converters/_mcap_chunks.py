@@ -47,9 +47,9 @@ def summary_of(reader: Any, file: BinaryIO) -> Any:
 
 
 def content(file: BinaryIO, opcode: int, at: int, size: int) -> list[Any]:
-    """Definitions and messages in the record at a byte: itself or, of a chunk, what is in it; none of any other kind.
+    """Definitions and messages in the record at a byte, which may be a chunk.
 
-    An attachment, which may be larger than memory, is not read.
+    Records of other kinds hold none. An attachment, which may be larger than memory, is not read.
     """
     from mcap.data_stream import ReadDataStream
     from mcap.records import Channel, Chunk, Schema
@@ -147,7 +147,9 @@ class Content:
 
 
 def records(file: BinaryIO, summary: Any, end: int | None = None) -> Iterator[tuple[int, int, int]]:
-    """Opcode, place and size of each record of the data section, up to `end` if it was cut there; `file` is at its content.
+    """Opcode, place and size of each record of the data section.
+
+    The file is at the content of the record. A log that was cut is read up to `end`.
 
     Raises:
         ValueError: a record that crosses the end.

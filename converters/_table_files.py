@@ -114,11 +114,21 @@ def may_hold_several(path: Path) -> bool:
 def _times_fall(path: Path, names: list[str]) -> bool:
     """Whether a time of a Parquet file goes back."""
     times = [*filter(is_named_time, names)]
+    fallen, others, last = set[str](), set[str](), dict[str, Any]()
     with refusing(path):
-        columns = _module("pyarrow.parquet", path).read_table(path, columns=times).columns if times else []
-    plain = (column for column in columns if re.match(NUMBERS, str(column.type)) and not column.null_count)
-    values = [column.cast("int64" if re.match(r"time\d\d", str(column.type)) else column.type).to_numpy() for column in plain]
-    return any((np.diff(each.astype(np.int64 if each.dtype.kind == "M" else float)) < 0).any() for each in values)
+        file = _module("pyarrow.parquet", path).ParquetFile(path)
+        for batch in file.iter_batches(columns=times) if times else ():  # a file of a few bytes may unpack to gigabytes
+            for name, column in zip(batch.schema.names, batch.columns, strict=True):
+                if not re.match(NUMBERS, str(column.type)) or column.null_count:
+                    others.add(name)
+                    continue
+                kind = "int64" if re.match(r"time\d\d", str(column.type)) else column.type
+                values = column.cast(kind).to_numpy(zero_copy_only=False)
+                values = values.astype(np.int64 if values.dtype.kind == "M" else float)
+                if (np.diff(values, prepend=last.get(name, values[:1])) < 0).any():
+                    fallen.add(name)
+                last[name] = values[-1:]
+    return bool(fallen - others)
 
 
 def _names_of(path: Path, kind: str) -> list[str]:

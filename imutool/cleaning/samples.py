@@ -19,7 +19,7 @@ STEP_NS = nanoseconds(0.1)
 STEP_S = 0.1  # of `Motion`
 MAX_FRAMES = 4  # that a warning names
 FIRST_MESSAGES = 1000  # that show whether sensors take turns
-MAX_CHANGES = 0.1  # of the frame, by messages: more are of sensors that take turns
+FEW_CHANGES, MAX_CHANGES = 10, 0.01  # of the frame, the second by messages: more are of sensors that take turns
 MAX_COUNTED = 1000  # a hostile log names another frame in each message
 MAX_RATES = 20_000  # samples of the gyro that are kept as they are: 480 kB
 
@@ -67,9 +67,9 @@ class FrameCounts(Counter[str]):
         return [f"the messages name {len(named)} frames: {some}; several sensors have no common bias"]
 
     def mixed(self) -> str:
-        """Reason not to use samples of sensors that take turns; empty where one sensor may have had several names."""
+        """Reason to distrust a topic on which sensors take turns; empty for one sensor."""
         named = sorted(frame for frame in self if frame)
-        takes_turns = 2 <= len(named) <= MAX_FRAMES and self.changes > self.total() * MAX_CHANGES
+        takes_turns = 2 <= len(named) <= MAX_FRAMES and self.changes > max(FEW_CHANGES, self.total() * MAX_CHANGES)
         return f"{len(named)} sensors take turns on the topic ({', '.join(named)})" if takes_turns else ""
 
 

@@ -21,8 +21,8 @@ from imutool.fleet.sources import simulation
 from imutool.fleet.targets import digest, is_current, page_name, remove_files, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.mcap_io.codec.joined_imu import parse_parts
-from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.losses import unchecked
+from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.storage.target import Target
 from imutool.processes.system import peak_bytes, user
@@ -162,7 +162,7 @@ def _imus(job: _Job) -> tuple[str, ...]:
     named = job.settings.imus
     if not named:
         return ()
-    with Log(job.source) as log:
+    with RecoveredLog(job.source) as log:
         found = tuple(imu for imu in named if {*(parse_parts(imu) or (imu,))} <= log.topics.keys())
         if not found:
             what = f"the log has no topic {' or '.join(named)}"

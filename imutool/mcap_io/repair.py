@@ -9,8 +9,6 @@ recovery must not make them look proven.
 from __future__ import annotations
 
 import json
-import os
-import secrets
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -33,7 +31,7 @@ from imutool.mcap_io.recovery.recovered_index import RecoveredIndex
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.storage.source import BLOCK_BYTES, Source, crc_of
-from imutool.mcap_io.storage.target import Target
+from imutool.mcap_io.storage.target import Target, temporary
 from imutool.mcap_io.verify import verify, verify_index
 from imutool.processes.system import collector_paused
 
@@ -289,7 +287,7 @@ def repaired(source: Location, beside: Location, max_chunk: int | None) -> Itera
     if intact:
         yield None
         return
-    copy = beside.with_name(f".{source.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
+    copy = temporary(beside)
     try:
         yield copy, repair(source, copy, max_chunk=max_chunk).losses
     except ImutoolError as error:  # the user does not know the copy

@@ -30,6 +30,7 @@ from imutool.cli.app import _Commands
 from imutool.cli.demo import write_asl
 from imutool.errors import ConfigError
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.repair import repaired
 from imutool.mcap_io.storage.local import MARK_PART, PARTIAL, remove_abandoned, temporary_path
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.storage.target import Target
@@ -459,6 +460,20 @@ def test_partial_files_are_removed_by_the_rule_alone(tmp_path: Path) -> None:
     remove_abandoned(place)
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {path.name for path in (mine, elsewhere, of_another_name, fresh, foreign)}
+
+
+def test_the_copy_of_a_damaged_log_is_a_partial_file_of_the_target(tmp_path: Path) -> None:
+    """No later run removed a copy that a killed debias left, as large as the log."""
+    write(flight(1, duration_s=BRIEF_S), tmp_path / "in.mcap")
+    os.truncate(tmp_path / "in.mcap", (tmp_path / "in.mcap").stat().st_size // 2)
+    with repaired(tmp_path / "in.mcap", tmp_path / "out.mcap", None) as saved:
+        assert saved is not None
+        copy, _ = saved
+        assert isinstance(copy, Path)
+        for partial in (copy, temporary_path(copy)):  # when complete, and while it is written
+            found = PARTIAL.fullmatch(partial.name)
+            assert found is not None
+            assert found["name"] == "out.mcap"
 
 
 def test_a_living_process_keeps_its_partial_file(tmp_path: Path) -> None:

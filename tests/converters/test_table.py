@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import tracemalloc
 import zipfile
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,7 +14,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
-from imutool.converters import table
+from imutool.converters import _table_mat, table
+from imutool.errors import DataError
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.sensor.made_up_flight import flight
@@ -356,6 +358,22 @@ def test_what_a_table_file_cannot_give_is_said_with_what_to_do(convert, tmp_path
         done = convert(tmp_path / name, tmp_path / "out.mcap")
         assert done.returncode == 4, done.stderr
         assert all(sentence in done.stderr for sentence in sentences), done.stderr
+
+
+def test_a_parquet_file_of_a_few_bytes_is_refused_before_it_unpacks(tmp_path, monkeypatch):
+    """Its times were read whole, to see whether they go back: 4 MB took gigabytes, and ended in a traceback."""
+    import pyarrow
+    import pyarrow.parquet
+
+    alike = {name: np.full(1 << 20, 9.81) for name in ("t", "gx", "gy", "gz", "ax", "ay", "az")}
+    pyarrow.parquet.write_table(pyarrow.table(alike), tmp_path / "bomb.parquet")
+    monkeypatch.setattr(_table_mat, "LIMIT", 8 << 20)
+    tracemalloc.start()
+    with pytest.raises(DataError, match=f"unpacks to {7 * 8 << 20} bytes"):
+        list(table.read(tmp_path / "bomb.parquet"))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 << 20
 
 
 @pytest.mark.parametrize("start", [b"PAR1", b"\x89HDF\r\n\x1a\n", b"MATLAB 5.0 MAT-file, made up"])

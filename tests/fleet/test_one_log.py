@@ -96,6 +96,9 @@ def test_a_fleet_names_the_imus_of_all_its_logs(logs: Path, tmp_path: Path, sett
     for log, topics in ((two, ["/imu1", "/imu0"]), (logs / "flight_1.mcap", ["/imu0"])):
         done = work(task(log, tmp_path / "out", named, name=log.name))
         assert (done.status, [imu.topic for imu in done.imus]) == ("ok", topics), done.error
+    os.truncate(two, two.stat().st_size * 3 // 4)
+    done = work(task(two, tmp_path / "out", named, name="cut.mcap"))
+    assert (done.status, [imu.topic for imu in done.imus]) == ("lost", ["/imu1", "/imu0"]), done.error
     quick = Settings(command="diagnose", quick=True, imu=("/imu1", "/imu0"))
     assert work(task(logs / "flight_1.mcap", tmp_path / "found", quick, name="flight_1.json")).status == "ok"
 

@@ -1,4 +1,4 @@
-"""Frames: messages of one topic that name several, as two sensors on it do; those that take turns have no common bias."""
+"""Frames: messages of one topic that name several, as two sensors on it do."""
 
 from __future__ import annotations
 

@@ -153,8 +153,9 @@ def _open_number(path: Path) -> int | None:
 def temporary_path(path: Path) -> Path:
     """Path of a temporary file or folder next to a place, marked with machine, boot and process."""
     place = path.absolute() if not path.name else path  # "." has no name of its own
+    own = PARTIAL.fullmatch(place.name)  # a temporary file of a temporary file belongs to the same place
     mark = f"{_machine()}{_boot()}{_start(os.getpid()) or '0' * MARK_PART}{secrets.token_hex(MARK_PART // 2)}"
-    return place.with_name(f".{_short(place.name)}.{os.getpid()}.{mark}.partial")
+    return place.with_name(f".{own['name'] if own else _short(place.name)}.{os.getpid()}.{mark}.partial")
 
 
 def _short(name: str) -> str:

@@ -139,9 +139,16 @@ def copy_file(source: Path, target: Location, *, overwrite: bool) -> None:
         out.copy(opened, 0, opened.size)
 
 
+def temporary(path: Location) -> Location:
+    """Temporary name beside a place, which a later run on it knows as its own."""
+    if isinstance(path, Path):
+        return temporary_path(path)
+    return path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
+
+
 def _medium(path: Location) -> LocalFile | Upload:
     if not isinstance(path, Path):
-        return Upload(path, f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.partial")
+        return Upload(path, temporary(path).name)
     return Stream(path) if is_stream(path) else LocalFile(path)
 
 
