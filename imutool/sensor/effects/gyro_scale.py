@@ -1,4 +1,4 @@
-"""Scale error of the gyro: omega (1 + s), per axis; with `t_step` from one time on, as a mount that slips."""
+"""Scale error of the gyro: omega (1 + s), per axis; with `t_step` it begins at that time."""
 
 from __future__ import annotations
 
