@@ -13,7 +13,7 @@ import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from itertools import pairwise
 from typing import TypeVar
 
@@ -103,7 +103,7 @@ def ros1_definition(schema_name: str) -> str:
     return separator.join(part for part in known if not part.startswith("builtin_interfaces/Time"))
 
 
-@cache
+@lru_cache(4096)
 def canonical(schema_name: str) -> str:
     """ROS 2 spelling of a name: of `sensor_msgs/Imu` and `sensor_msgs::msg::dds_::Imu_`."""
     if dds := DDS_NAME.fullmatch(schema_name):
