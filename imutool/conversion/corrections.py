@@ -212,10 +212,13 @@ class _MessagePatch:
     def move_stamp(self, by_ns: int, which: int = 0) -> None:
         """Shift a stamp."""
         moved_ns = self.stamp_ns(which) + by_ns
-        if moved_ns < 0 and self.layout.seconds == "u4":
-            what = f"a stamp of {moved_ns - by_ns} ns, moved by {by_ns} ns, lies before 0"
-            raise DataError(what, expected="stamps that ROS 1 can store", fix="Cut the log there, or convert it to ROS 2 first")
-        self._stamp.pack_into(self.data, self.layout.stamps[which], *divmod(moved_ns, schemas.NS_PER_S))
+        seconds, nanos = divmod(moved_ns, schemas.NS_PER_S)
+        try:
+            self._stamp.pack_into(self.data, self.layout.stamps[which], seconds, nanos)
+        except struct.error as error:
+            what = f"a stamp of {moved_ns - by_ns} ns, moved by {by_ns} ns, does not fit its field"
+            fix = "Cut the log there, or convert it to ROS 2 first" if moved_ns < 0 else "Cut the log there"
+            raise DataError(what, expected="stamps that ROS can store", fix=fix) from error
 
 
 def _corrected_imu(patch: _MessagePatch, gyro: Float64[np.ndarray, "3 3"], accel: Float64[np.ndarray, "3 3"]) -> bytes:

@@ -25,7 +25,7 @@ from imutool.conversion.corrections import RECORD, Corrections
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.run import convert
 from imutool.converters import fetch
-from imutool.errors import LogError
+from imutool.errors import DataError, LogError
 from imutool.evaluation import evaluate
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
@@ -356,6 +356,16 @@ def test_poses_of_another_frame_keep_their_clock(tmp_path: Path) -> None:
     assert times["/mocap/pose"] == made.truth.t_ns.tolist()
     assert {m.publish_time for m in corrected if m.topic.name == "/mocap/pose"} == {0, 2**64 - 1}
     assert [m.log_time for m in corrected] == sorted(m.log_time for m in corrected)
+
+
+@pytest.mark.parametrize("late_s", [2**33, -(2**33)])
+def test_a_stamp_that_no_field_holds_after_its_correction_is_named(late_s: int, made: Recording, tmp_path: Path) -> None:
+    write(made, tmp_path / "log.mcap")
+    module = registry.load("imutool.converters", "mcap_log")
+    content = module.read_sequence(next(iter(module.sequences(tmp_path / "log.mcap"))))
+    late = Corrections(frame_id="world", late_ns=late_s * 10**9, pose_topic="/ground_truth/pose")
+    with pytest.raises(DataError, match="does not fit its field; expected stamps that ROS can store"):
+        list(late.put_on(content).messages())
 
 
 def test_a_right_log_stays_as_it_is(made: Recording, tmp_path: Path) -> None:
