@@ -88,7 +88,8 @@ def calibrate(
     """
     if names is None:
         also = () if signals is None or signals.temperature is None else (temperature.FORMS[sensor],)
-        effects = catalogue.trained(sensor) + also
+        several = len(pool.names) > 1  # one log does not show whether a clock is the sensor's or that of its poses
+        effects = tuple(form for form in catalogue.trained(sensor) + also if several or form.name != "clock_offset")
     else:
         effects = temperature.forms(sensor, names)
     cut = folded(pool) if part == "train" else pool

@@ -131,6 +131,14 @@ def test_a_clock_that_all_flights_share_is_found(three: Callable[[int], list[Rec
     assert float(calibration.theta[0]) == pytest.approx(planted_theta(effects)[0], rel=0.05)
 
 
+def test_a_clock_of_one_log_is_not_the_sensors(three: Callable[[int], list[Recording]]) -> None:
+    """It may be that of the poses: other logs would be shifted by it."""
+    flight = three(OTHERS[-1])[:1]
+    calibration = found(flight, "gyro", catalogue.trained("gyro", ["clock_offset"]))
+    assert calibration.effects == found(flight, "gyro", ()).effects == LINEAR["gyro"]
+    assert np.abs(z_scores(calibration, np.zeros(len(calibration.theta)))).max() < SURE
+
+
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])
 @pytest.mark.parametrize("first", OTHERS)
 def test_where_nothing_is_planted_scale_and_misalignment_are_near_zero_and_nothing_else_is_found(
