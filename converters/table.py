@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.errors import ConfigError, DataError
+from imutool.errors import ConfigError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses, Scalars, unit_quaternions
 from imutool.recording.joined_imu import joined
