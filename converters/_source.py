@@ -11,7 +11,7 @@ import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
-from imutool.errors import DataError
+from imutool.errors import ConfigError, DataError
 
 from . import Sequence
 from ._archive import (
@@ -40,13 +40,14 @@ def find(source: Path) -> list[Sequence]:
     Unreadable archives in a folder are listed too.
 
     Raises:
-        DataError: the source does not exist, or is itself an archive that cannot be read.
+        ConfigError: the source does not exist.
+        DataError: it is itself an archive that cannot be read.
     """
     if source.is_dir():
         folder = named_folder(source)
         return [Sequence(folder.parent.name, folder.parent)] if folder.name == ROOT else list(_in_folder(folder))
     if not source.exists():
-        raise DataError("does not exist", where=source, expected="a log, a table, an archive, or a folder of these")
+        raise ConfigError("does not exist", where=source, expected="a log, a table, an archive, or a folder of these")
     return _in_file(source)
 
 
@@ -198,13 +199,13 @@ def find_files(source: Path, suffixes: Collection[str], is_mine: Callable[[bytes
     """Find files of one kind: a file of any name, or those in a folder with one of the suffixes.
 
     Raises:
-        DataError: the source does not exist.
+        ConfigError: the source does not exist.
     """
     if source.is_dir():
         paths = (path for path in each_path(named_folder(source)) if path.suffix.lower() in suffixes)
         return [Sequence(name(path), path) for path in paths if is_mine(head(path))]
     if not source.exists():
-        raise DataError("does not exist", where=source, expected="a file or a folder")
+        raise ConfigError("does not exist", where=source, expected="a file or a folder")
     return [Sequence(name(source), source)] if is_mine(head(source)) else []
 
 

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.errors import ConfigError, DataError
+from imutool.errors import ConfigError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses, Scalars, unit_quaternions
 from imutool.recording.joined_imu import joined
@@ -67,7 +67,7 @@ def sequences(source: Path) -> list[Sequence]:
     if source.is_dir():
         return [each for found in sequences_below(source) for each in recordings_in(found)]
     if not source.exists():
-        raise DataError("does not exist", where=source, expected="a file or a folder")
+        raise ConfigError("does not exist", where=source, expected="a file or a folder")
     return recordings_in(Sequence(name(Path(table_name(source))), source)) if kind_of(head(source), source) else []
 
 

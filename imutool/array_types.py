@@ -24,6 +24,7 @@ if TYPE_CHECKING or "jaxtyping" in sys.modules:
         UInt32,
         UInt64,
     )
+    from numpy.typing import ArrayLike
 else:
 
     class Shaped:
@@ -32,6 +33,21 @@ else:
         def __class_getitem__(cls, item: tuple[Any, str]) -> Any:
             return item[0]
 
+    ArrayLike = Any
     Bool = Complex128 = Float = Float64 = Int = Int64 = Num = UInt8 = UInt16 = UInt32 = UInt64 = Shaped
 
-__all__ = ["Bool", "Complex128", "Float", "Float64", "Int", "Int64", "Num", "Shaped", "UInt8", "UInt16", "UInt32", "UInt64"]
+__all__ = [
+    "ArrayLike",
+    "Bool",
+    "Complex128",
+    "Float",
+    "Float64",
+    "Int",
+    "Int64",
+    "Num",
+    "Shaped",
+    "UInt8",
+    "UInt16",
+    "UInt32",
+    "UInt64",
+]

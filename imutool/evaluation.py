@@ -51,7 +51,7 @@ Refused = Callable[[str, ImutoolError], None]
 def evaluate(
     log: Path,
     *,
-    models: Sequence[str | Path] = (),
+    models: Sequence[str | Path | BiasModel] = (),
     init: str = "auto",
     smooth: bool = False,
     aid: str | None = None,
@@ -123,7 +123,7 @@ def _evaluated(
     recording: Recording,
     debiased: Imu | None,
     log: Path,
-    models: Sequence[str | Path],
+    models: Sequence[str | Path | BiasModel],
     init: str,
     smooth: bool,
     aids: Aids | None,
@@ -239,7 +239,7 @@ def _corrected(
 
 
 def runs(
-    recording: Recording, models: Sequence[str | Path], init: str, where: str | Path
+    recording: Recording, models: Sequence[str | Path | BiasModel], init: str, where: str | Path
 ) -> Iterator[tuple[str, DebiasedImu, InitialBias | None]]:
     """Samples as recorded, then corrected by each model: name, samples and bias, initial bias."""
     yield RAW, DebiasedImu(recording.imu, np.zeros((len(recording.imu), 6))), None
@@ -249,7 +249,7 @@ def runs(
 
 def started(
     recording: Recording,
-    models: Sequence[str | Path],
+    models: Sequence[str | Path | BiasModel],
     init: str,
     where: str | Path,
     *,
@@ -259,8 +259,7 @@ def started(
 ) -> Iterator[tuple[str, BiasModel, InitialBias]]:
     """Model name, model and initial bias in this recording, for each requested model.
 
-    With `force` models of other rates count, too. With `refused` a model that does not apply to the recording is left out,
-    and `refused` is called with it and the error.
+    With `force` models of other rates count, too. `refused` is called with each that does not apply, and with the error.
     """
     check_start(init, smooth)
     for given, loaded in [(given, _load(given, recording)) for given in models]:  # a model that is none ends it at once
@@ -274,9 +273,11 @@ def started(
         yield str(model.card.get("name", model.method)), model, start
 
 
-def _load(given: str | Path, recording: Recording) -> BiasModel | None:
-    """Model of a file or that ships; None for `static`, which is not trained."""
-    return None if str(given) == static.Model.method else find_model(given, 1.0 / recording.imu.period_s)
+def _load(given: str | Path | BiasModel, recording: Recording) -> BiasModel | None:
+    """Model itself, of a file, or that ships; None for `static`, which is not trained."""
+    if str(getattr(given, "method", given)) == static.Model.method:
+        return None
+    return given if isinstance(given, BiasModel) else find_model(given, 1.0 / recording.imu.period_s)
 
 
 def _model_and_start(
@@ -287,14 +288,12 @@ def _model_and_start(
     model: BiasModel = static.Model() if trained is None else bound_to(trained, recording, where, force=force)
     for remark in model.remarks:
         logger.warning("%s: %s", recording.name, remark)
-    if smooth:
-        return model, smooth_in_memory(model, recording.imu, where)
-    return model, find_initial_bias(init, model, recording)
+    return model, smooth_in_memory(model, recording.imu, where) if smooth else find_initial_bias(init, model, recording)
 
 
-def _refuse_twins(models: Sequence[str | Path]) -> None:
+def _refuse_twins(models: Sequence[str | Path | BiasModel]) -> None:
     """Two trajectories of one name would be one file; those of the samples and of the truth have names, too."""
-    names = [RAW, TRUTH, *(Path(model).stem for model in models)]
-    for name in names:
-        if names.count(name) > 1:
-            raise ConfigError(f"two trajectories are called {name!r}", where="trajectories", fix="Rename a model's file")
+    own = (model.card.get("name", model.method) if isinstance(model, BiasModel) else Path(model).stem for model in models)
+    names = [RAW, TRUTH, *own]
+    if twins := [name for name in names if names.count(name) > 1]:
+        raise ConfigError(f"two trajectories are called {twins[0]!r}", where="trajectories", fix="Rename a model's file")

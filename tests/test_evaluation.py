@@ -17,6 +17,7 @@ from support import driven
 from support.evo import statistics
 from typer.testing import CliRunner
 
+import imutool
 from imutool import evaluation
 from imutool.bias import linear
 from imutool.bias.model_file import find_model, save
@@ -277,6 +278,14 @@ def test_taking_off_the_true_bias_helps(log: Path, recording: Recording) -> None
     np.testing.assert_allclose([*static["gyro_bias"], *static["accel_bias"]], np.concatenate(bias), rtol=1e-12)
     assert static["init"] == words
     assert static["init_how"] == "given"
+
+
+def test_a_loaded_model_scores_as_its_file_does(log: Path, model: Path, tmp_path: Path) -> None:
+    loaded = [imutool.load_model("static"), imutool.load_model(model)]
+    assert imutool.evaluate(log, models=loaded) == evaluate(log, models=["static", model])
+    assert imutool.evaluate(log, models=loaded[1], trajectories=tmp_path)[1]["model"] == "linear_1"
+    with pytest.raises(ConfigError, match="two trajectories are called 'linear_1'"):
+        imutool.evaluate(log, models=[model, loaded[1]], trajectories=tmp_path, overwrite=True)
 
 
 def test_an_aided_path_is_a_row_beside_pure_integration(log: Path, model: Path, tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import pickle
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -174,6 +176,15 @@ def test_wrong_shapes_and_types_are_refused_without_the_type_checker_too(
 )
 def test_what_converts_without_loss_is_taken(t_ns: Any, gyro: Any) -> None:
     assert unchecked(Imu, t_ns, gyro, V) == Imu(T, V, V)
+
+
+@pytest.mark.parametrize("kind", [Imu, Poses, Scalars])
+def test_type_checkers_know_that_lists_are_taken(kind: type) -> None:
+    defined = [node for node in ast.walk(ast.parse(inspect.getsource(kind))) if isinstance(node, ast.FunctionDef)]
+    (known,) = [node.args for node in defined if node.name == "__init__"]
+    assert [each.arg for each in known.args[1:]] == list(inspect.signature(kind).parameters)
+    arrays = [ast.unparse(each.annotation) for each in known.args if each.annotation and each.arg != "unit"]
+    assert {text.split(" | ")[0] for text in arrays} == {"ArrayLike"}
 
 
 def test_a_column_of_numbers_is_a_scalar() -> None:

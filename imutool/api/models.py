@@ -21,7 +21,7 @@ from imutool.bias_start.correction import apply_with_std
 from imutool.bias_start.earlier_load import switched_on_before
 from imutool.bias_start.fitness import CHECKED_S, judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
-from imutool.bias_start.model_choice import bound_to, check_start, find_initial_bias, smooth_in_memory
+from imutool.bias_start.model_choice import find_initial_bias
 from imutool.bias_start.stretches import measured_imu, unusual_gravity
 from imutool.debiasing import DEBIASED_BY, DebiasReport
 from imutool.errors import ConfigError, DataError
@@ -253,24 +253,10 @@ def _debias_recording(recording: Recording, model: object, init: str, smooth: bo
     first_ns = int(recording.imu.t_ns[0]) if len(recording.imu) else 0
     begun = recording.between(first_ns, first_ns + nanoseconds(CHECKED_S))  # as much as the command looks at
     wrong = [text for whole in warn_of_recordings([begun]) for text in contradictions(whole)]
-    name, chosen, start = _model_and_start(recording, model, init, smooth, force)
+    given = next(iter(shipped_for(about)), static.Model.method) if model is None else model
+    ((name, chosen, start),) = evaluation.started(recording, [given], init, recording.name, smooth=smooth, force=force)
     fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], about).beside(wrong)
     fitness.report(name, recording.name, force=force)
     debiased, std = apply_with_std(chosen, start, recording.imu)
     marked = {**recording.metadata, "imutool": {**about, DEBIASED_BY: name}}
     return DebiasedRecording(replace(recording, imu=debiased.imu, metadata=marked), debiased.bias, std, name, start, fitness)
-
-
-def _model_and_start(
-    recording: Recording, model: Model | None, init: str, smooth: bool, force: bool
-) -> tuple[str, BiasModel, InitialBias]:
-    if model is None:
-        model = next(iter(shipped_for(recording.metadata.get("imutool", {}))), static.Model.method)
-    if not isinstance(model, BiasModel) or model.method == static.Model.method:
-        given = static.Model.method if isinstance(model, BiasModel) else model
-        ((name, chosen, start),) = evaluation.started(recording, [given], init, recording.name, smooth=smooth, force=force)
-        return name, chosen, start
-    check_start(init, smooth)
-    model = bound_to(model, recording, force=force)
-    start = smooth_in_memory(model, recording.imu, recording.name) if smooth else find_initial_bias(init, model, recording)
-    return str(model.card.get("name", model.method)), model, start

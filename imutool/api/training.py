@@ -84,7 +84,7 @@ def train(
 def evaluate(
     log: LogPath | Recording,
     *,
-    models: Sequence[str | Path] | str | Path = (),
+    models: Sequence[str | Path | BiasModel] | str | Path | BiasModel = (),
     init: Init = "auto",
     smooth: bool = False,
     aid: str | None = None,
@@ -97,7 +97,7 @@ def evaluate(
 
     Args:
         log: MCAP log with true poses, or a recording of arrays.
-        models: Model files, names of models that ship, or `static`; one, or several.
+        models: Model files, names of models that ship, `static`, or loaded models; one, or several.
         init: Initial bias, as in `debias`.
         smooth: Smoothing, as in `debias`.
         aid: Also score the smoothed path with these aids: `auto` (all that the log has), or some of `stops`, `barometer`,

@@ -149,16 +149,17 @@ def over_all_rest(model: BiasModel, blocks: Blocks) -> InitialBias:
     Raises:
         DataError: the log never rests.
     """
-    ranges = _calm(blocks, resting_blocks(blocks))
-    if not ranges:
+    stops = resting_blocks(blocks)
+    if not stops:
         raise DataError("the log never rests", expected="1.5 s or more without motion")
-    stretches = []
-    for first, last in ranges:
+    stretches, calm = [], _calm(blocks, stops)
+    for first, last in calm:
         part, mean = slice(first, last), blocks.mean[first:last].mean(axis=0)
         squares = (blocks.k - 1) * blocks.var[part] + blocks.k * (blocks.mean[part] - mean) ** 2
         ends_ns = int(blocks.first_ns[first]), int(blocks.last_ns[last - 1])
         stretches.append(_RestStretch(mean, squares.sum(axis=0), (last - first) * blocks.k, *ends_ns))
-    return _combined(prior(model), stretches, int(blocks.first_ns[0]))
+    start = _combined(prior(model), stretches, int(blocks.first_ns[0]))
+    return start if list(calm) == stops else replace(start, how=f"the calmest {start.how}")
 
 
 def _calm(blocks: Blocks, ranges: Sequence[tuple[int, int]]) -> Sequence[tuple[int, int]]:

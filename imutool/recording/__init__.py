@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64, Int64
+from imutool.array_types import ArrayLike, Bool, Float64, Int64
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording.columns import Columns, checked_mapping, clock_jumps, converted
@@ -49,6 +49,9 @@ class Imu(Columns):
     t_ns: Times
     gyro: Float64[np.ndarray, "n 3"]
     accel: Float64[np.ndarray, "n 3"]
+    if TYPE_CHECKING:  # lists become arrays
+
+        def __init__(self, t_ns: ArrayLike, gyro: ArrayLike, accel: ArrayLike) -> None: ...
 
     def __post_init__(self) -> None:
         self.check(gyro=(3,), accel=(3,))
@@ -75,6 +78,9 @@ class Poses(Columns):
     p_wb: Float64[np.ndarray, "n 3"]
     q_wb_wxyz: Float64[np.ndarray, "n 4"]
     v_w: Float64[np.ndarray, "n 3"] | None = None
+    if TYPE_CHECKING:
+
+        def __init__(self, t_ns: ArrayLike, p_wb: ArrayLike, q_wb_wxyz: ArrayLike, v_w: ArrayLike | None = None) -> None: ...
 
     def __post_init__(self) -> None:
         self.check(p_wb=(3,), q_wb_wxyz=(4,), v_w=(3,))
@@ -131,6 +137,9 @@ class Scalars(Columns):
     t_ns: Times
     values: Float64[np.ndarray, "n k"]
     unit: str = ""
+    if TYPE_CHECKING:
+
+        def __init__(self, t_ns: ArrayLike, values: ArrayLike, unit: str = "") -> None: ...
 
     def __post_init__(self) -> None:
         values = converted(self.values, "Scalars.values")
@@ -229,12 +238,8 @@ class Recording:
         if not self.other_poses:
             return DataError(what, where=self.name, expected=expected, fix="Convert the IMU together with its true poses")
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in self.other_poses.items())
-        return DataError(
-            f"{what}: the poses are {listed}",
-            where=self.name,
-            expected=expected,
-            fix="Name one with `truth` to use it anyway",
-        )
+        fix = "Name one with `truth` to use it anyway"
+        return DataError(f"{what}: the poses are {listed}", where=self.name, expected=expected, fix=fix)
 
     def with_truth(self, topic: str) -> Recording:
         """Recording with only one of its true trajectories.
@@ -243,20 +248,15 @@ class Recording:
             DataError: no such topic; the message lists the available ones.
         """
         if topic not in self.truths:
-            raise DataError(
-                f"no true poses on {topic}", where=self.name, expected=f"one of {', '.join(self.truths) or '(none)'}"
-            )
+            known = ", ".join(self.truths) or "(none)"
+            raise DataError(f"no true poses on {topic}", where=self.name, expected=f"one of {known}")
         return replace(self, truths={topic: self.truths[topic]})
 
     def between(self, start_ns: int, end_ns: int) -> Recording:
         """Recording without frames, cut to `start_ns <= t_ns <= end_ns`."""
-        return replace(
-            self,
-            imu=self.imu.between(start_ns, end_ns),
-            truths={k: v.between(start_ns, end_ns) for k, v in self.truths.items()},
-            scalars={k: v.between(start_ns, end_ns) for k, v in self.scalars.items()},
-            frames={},
-        )
+        truths = {k: v.between(start_ns, end_ns) for k, v in self.truths.items()}
+        scalars = {k: v.between(start_ns, end_ns) for k, v in self.scalars.items()}
+        return replace(self, imu=self.imu.between(start_ns, end_ns), truths=truths, scalars=scalars, frames={})
 
     def between_jumps(self) -> list[Recording]:
         """Recordings of the stretches between jumps of the IMU's clock; the recording itself without a jump."""

@@ -98,7 +98,7 @@ class Outputs:
                 self._peer = connect.probe(url)
             except ConfigError as error:
                 self.refused = error
-                logger.warning("%s", error)
+                logger.warning("%s: %s; an .rrd is saved in its place", error.where, error.what)
         if asked.web:
             self._server = self._stack.enter_context(web.Server(asked.port))
 

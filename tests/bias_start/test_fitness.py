@@ -261,15 +261,17 @@ def test_a_steady_turn_about_gravity_is_no_stop(start: str, turn_rad_s: float, m
         assert np.linalg.norm(bias - model.prior_mean[:3]) == pytest.approx(turn_rad_s * untrained, abs=5e-3)
 
 
-@pytest.mark.parametrize("jitter", [0.0, 0.4])
-def test_another_rate_is_a_doubt_where_the_steps_show_it(jitter: float, model: BiasModel, recording: Recording) -> None:
-    """The median step of stamps that jitter scatters by itself."""
+@pytest.mark.parametrize(("slower", "jitter", "is_doubt"), [(0.02, 0.0, True), (0.02, 0.4, False), (0.005, 0.0, False)])
+def test_another_rate_is_a_doubt_where_the_steps_show_it(
+    slower: float, jitter: float, is_doubt: bool, model: BiasModel, recording: Recording
+) -> None:
+    """The median step of stamps that jitter scatters by itself; a logger's own jitter of 0.5 % changes no model."""
     imu, period_ns = recording.imu, 1e9 * recording.imu.period_s
     late_ns = np.random.default_rng(6).uniform(-jitter, jitter, len(imu)) * period_ns
     found = judged(
-        model, Imu(imu.t_ns + (0.005 * period_ns * np.arange(len(imu)) + late_ns).astype(np.int64), imu.gyro, imu.accel)
+        model, Imu(imu.t_ns + (slower * period_ns * np.arange(len(imu)) + late_ns).astype(np.int64), imu.gyro, imu.accel)
     )
-    assert ("Hz, in the training runs at" in " ".join(found.reasons)) == (jitter == 0.0), found
+    assert ("Hz, in the training runs at" in " ".join(found.reasons)) == is_doubt, found
 
 
 def test_an_unfit_model_is_refused_unless_forced_and_a_doubtful_one_is_used(

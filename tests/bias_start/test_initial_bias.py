@@ -141,7 +141,7 @@ def test_a_bias_at_rest_is_that_of_the_calm_stops() -> None:
     shaken = (t_s > 6.0) * (np.sin(2.0 * np.pi * 71.0 * t_s) * [0.03, 0.03, 0.03] + [0.0, 0.0, 0.01])
     start = over_all_rest(static.Model(), blocks_of(replace(imu, gyro=imu.gyro + shaken)))
     np.testing.assert_allclose(start.rest[:3], GYRO_BIAS, atol=1e-3)
-    assert start.how.startswith("6.")
+    assert start.how.startswith("the calmest 6.")
 
 
 def test_at_one_sample_a_second_the_calm_is_found_too() -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from imutool.converters import _archive, euroc
 from imutool.converters._source import find
-from imutool.errors import DataError
+from imutool.errors import ConfigError, DataError
 
 MEMORY_BOUND = 64 << 20  # far below what the bombs here unpack to, well above what reading a small archive takes
 
@@ -266,7 +266,7 @@ def test_nothing_is_written_beside_a_source(make):
 
 
 def test_a_source_that_does_not_exist_is_named(tmp_path):
-    with pytest.raises(DataError, match="does not exist"):
+    with pytest.raises(ConfigError, match="does not exist"):
         euroc.sequences(tmp_path / "nowhere")
 
 
