@@ -137,8 +137,10 @@ def _turning(columns: Columns, names: list[str]) -> _Halves | None:
 def _has_gravity(columns: Columns, triple: list[str], factor: float = 1.0) -> bool:
     """Whether three columns have the size of gravity, and seldom less, as rates of a fast flight about 1 rad/s have.
 
-    A direction, as the row of a rotation, has not.
+    A direction, as the row of a rotation, has not, and counts next to a fraction, as of satellites and a latitude.
     """
+    if len({columns.values[name].dtype.kind for name in triple}) > 1:
+        return False
     values = factor * np.stack([columns.values[name].astype(float) for name in triple])
     level, near = gravity_units(columns, triple, factor)
     near = near if factor == 1.0 else [unit for unit in near if unit == "m/s^2"]

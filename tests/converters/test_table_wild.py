@@ -484,11 +484,14 @@ def test_the_motion_shows_which_columns_of_a_wide_table_are_the_imu(tmp_path):
         read(tmp_path / "imu.csv")
     assert '# perhaps accel = ["column 12", "column 13", "column 14"]' in str(caught.value)
     assert '# perhaps gyro = ["column 9", "column 10", "column 11"]' in str(caught.value)
-    poses = np.column_stack([t_s, np.insert(turn.as_matrix().reshape(-1, 9), [3, 6, 9], 331_000.0, axis=1)])
-    (tmp_path / "global_pose.csv").write_text("\n".join(",".join(map(repr, row)) for row in poses.tolist()) + "\n")
-    with pytest.raises(ConfigError) as caught:
-        read(tmp_path / "global_pose.csv")
-    assert "perhaps" not in str(caught.value)  # the row of a rotation is no gravity in g
+    poses = np.insert(turn.as_matrix().reshape(-1, 9), [3, 6, 9], 331_000.0, axis=1).tolist()
+    gps = [[3, 9, 0.738 + t, -1.461, 270.0, 0.0, 0.0] for t in t_s.tolist()]  # of NCLT: mode, satellites, latitude
+    for others in (poses, gps):
+        lines = (",".join(map(repr, [t, *row])) for t, row in zip(t_s.tolist(), others, strict=True))
+        (tmp_path / "other.csv").write_text("\n".join(lines) + "\n")
+        with pytest.raises(ConfigError) as caught:
+            read(tmp_path / "other.csv")
+        assert "perhaps" not in str(caught.value)
 
 
 def test_axes_in_letters_come_before_numbered_columns_of_the_same_word(tmp_path):
