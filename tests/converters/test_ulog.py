@@ -60,6 +60,17 @@ def test_every_instance_is_an_imu_on_the_gyros_stamps(log):
     assert second.t_ns[0] == (START_US + 4000) * 1000  # the first gyro sample has no accelerometer sample ahead of it
 
 
+def test_a_gyro_of_several_pairs_with_the_only_accelerometer(tmp_path):
+    writer = Ulog()
+    for sensor, instances in (("sensor_gyro", (0, 1)), ("sensor_accel", (0,))):
+        for instance in instances:
+            rows = [(t, t, 1.0 + instance, 0.0, -9.75, 25.0) for t in range(5_000_000, 6_000_000, 4000)]
+            writer.topic(sensor, SENSOR, rows, instance)
+    (sequence,) = ulog.sequences(writer.write(tmp_path / "log.ulg"))
+    (imu,) = ulog.read_sequence(sequence).imus.values()
+    assert np.array_equal(imu.gyro[:, 0], np.ones(250))
+
+
 def test_every_topic_parameter_and_text_arrives(log):
     with log.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
