@@ -501,6 +501,14 @@ def test_axes_in_letters_come_before_numbered_columns_of_the_same_word(tmp_path)
     np.testing.assert_allclose(read(path).imus["/imu0"].accel, 9.80665 * ACCEL_G, rtol=1e-12)
 
 
+def test_the_axis_may_stand_in_front_as_in_messages_of_mavlink(tmp_path):
+    """As mavlogdump.py of pymavlink writes them."""
+    names = ["timestamp", *(f"HIGHRES_IMU.{a}{sensor}" for sensor in ("acc", "gyro", "mag") for a in "xyz")]
+    imu = read(write_csv(tmp_path / "highres.csv", names, [T_S, *ACCEL_G.T, *(COUNTS * 0.07).T, *ACCEL_G.T])).imus["/imu0"]
+    np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, rtol=1e-12)
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(COUNTS * 0.07), rtol=1e-12)
+
+
 def test_a_first_column_of_row_numbers_hides_no_time(tmp_path):
     names = ["", "Stop_watch", *NAMES[1:]]
     path = write_csv(tmp_path / "pandas.csv", names, [np.arange(COUNT), T_S, *ACCEL_G.T, *(COUNTS * 0.07).T])
