@@ -509,6 +509,16 @@ def test_the_axis_may_stand_in_front_as_in_messages_of_mavlink(tmp_path):
     np.testing.assert_allclose(imu.gyro, np.deg2rad(COUNTS * 0.07), rtol=1e-12)
 
 
+def test_the_poses_of_idol_are_those_of_its_table(tmp_path):
+    sensors = [f"iphone{sensor}{a}" for sensor in ("Acc", "Gyro") for a in "XYZ"]
+    names = ["timestamp", *sensors, *(f"orient{a}" for a in "WXYZ"), *(f"processedPos{a}" for a in "XYZ")]
+    columns = [T_S, *ACCEL_G.T, *(COUNTS * 0.07).T, *np.full((4, COUNT), 0.5), *ACCEL_G.T]
+    log = read(write_csv(tmp_path / "idol.csv", names, columns))
+    ((topic, poses),) = log.poses.items()
+    assert (log.kinds[topic], poses.q_wb_wxyz.tolist()) == ("estimate", [[0.5] * 4] * COUNT)
+    np.testing.assert_array_equal(poses.p_wb, ACCEL_G)
+
+
 def test_a_first_column_of_row_numbers_hides_no_time(tmp_path):
     names = ["", "Stop_watch", *NAMES[1:]]
     path = write_csv(tmp_path / "pandas.csv", names, [np.arange(COUNT), T_S, *ACCEL_G.T, *(COUNTS * 0.07).T])
