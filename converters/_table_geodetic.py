@@ -81,7 +81,7 @@ def _unit(columns: Columns, angles: list[str], values: Float64[np.ndarray, "n 3"
 
 
 def plane(values: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    """North, east and down (m) of latitude, longitude (rad) and height (m), about the first that is known."""
+    """North, east, down (m) of latitude, longitude (rad) and height (m), about the first known."""
     latitude, longitude, height = values[np.isfinite(values).all(axis=1)][0]
     bend = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
     east_m = SEMI_MAJOR_M / np.sqrt(bend)

@@ -34,7 +34,7 @@ def load_npz(path: Path, columns: Columns) -> None:
 
 
 def load_npy(path: Path, columns: Columns) -> None:
-    """Add one array, whose columns have no names unless its type or a file beside it states them."""
+    """Add one array, whose columns are named by its type or a file beside it, or not at all."""
     array = read_npy(path)
     if array.dtype.names:
         _add(columns, "", array)
