@@ -596,7 +596,7 @@ def test_an_array_that_a_description_names_has_the_poses_of_the_imu_beside_it(tm
     log = table.read_sequence(table.sequences(tmp_path)[0])
     np.testing.assert_array_equal(log.imus["/imu0"].gyro, GYRO)
     ((topic, poses),) = log.poses.items()
-    assert (log.kinds[topic], len(poses.t_ns)) == ("estimate", COUNT)
+    assert (log.kinds[topic], len(poses.t_ns), log.remarks.losses) == ("estimate", COUNT, [])
     np.testing.assert_allclose(poses.q_wb_wxyz[0], [0.7, 0.1, -0.1, 0.7], atol=1e-9)
     np.testing.assert_allclose(poses.p_wb, p)
 
