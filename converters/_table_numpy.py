@@ -12,6 +12,7 @@ import numpy as np
 
 from imutool.errors import DataError
 
+from ._source import head
 from ._table_headerless import name_headerless
 from ._table_mat import check_size
 from ._table_text import WIDEST, Columns
@@ -43,7 +44,7 @@ def load_npy(path: Path, columns: Columns) -> None:
         array = array.T
     each = [*np.atleast_2d(array.T)[:WIDEST]] if array.ndim in (1, 2) else []
     names = _names_beside(path)
-    named = len(names) == len(each)
+    named = len({*names}) == len(each)
     for number, column in enumerate(each):
         columns.add(names[number] if named else f"column {number + 1}", column)
     if not named:
@@ -53,10 +54,9 @@ def load_npy(path: Path, columns: Columns) -> None:
 def _names_beside(path: Path) -> list[str]:
     """Names of columns in the description beside an array, as TLIO has it: `["ts_us(1)", "qxyzw_World_Device(4)", ...]`."""
     try:
-        text = path.with_name(f"{path.stem}_description.json").read_text()
-        listed = json.loads(text)["columns_name(width)"]
+        listed = json.loads(head(path.with_name(f"{path.stem}_description.json")))["columns_name(width)"]
         parts = [(name, int(width.rstrip(")"))) for name, width in (each.split("(") for each in listed)]
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return []
     axes = {name: "xyzw" if name.startswith("qxyzw") else "xyz" for name, _ in parts}
     spelled = {name: re.sub("^qxyzw", "quat", name.removesuffix("_World_Device")) for name, _ in parts}

@@ -183,7 +183,9 @@ def _simulated_poses(messages: dict[str, Messages], remarks: Remarks) -> dict[st
     if "SIM" not in messages or not _are_numbers(messages["SIM"], SIMULATED_FIELDS):
         return {}
     rows = messages["SIM"].rows
-    kept = in_order(messages["SIM"].t_ns, np.stack([rows[f] for f in SIMULATED_FIELDS], axis=1).astype(float), TRUTH)
+    values = np.stack([rows[f] for f in SIMULATED_FIELDS], axis=1).astype(float)
+    values[~values[:, 3:].any(axis=1)] = np.nan  # no rotation
+    kept = in_order(messages["SIM"].t_ns, values, TRUTH)
     remarks.notes.extend(kept.notes)
     if not len(kept.t_ns):
         return {}
