@@ -125,7 +125,9 @@ def _poses(topics: dict[str, Columns], ending: str, remarks: Remarks) -> Poses |
     attitude, position = topics.get(f"vehicle_attitude{ending}"), topics.get(f"vehicle_local_position{ending}")
     if attitude is None:
         return None
-    q = in_order(_sample_ns(attitude), _vectors(attitude, "q[0] q[1] q[2] q[3]"), f"vehicle_attitude{ending}")
+    turns = _vectors(attitude, "q[0] q[1] q[2] q[3]")
+    turns[~turns.any(axis=1)] = np.nan  # not set yet
+    q = in_order(_sample_ns(attitude), turns, f"vehicle_attitude{ending}")
     remarks.notes.extend(q.notes)
     if not len(q.t_ns):
         return None
