@@ -55,11 +55,14 @@ def imus_of(topics: dict[str, Columns], remarks: Remarks) -> dict[str, Imu]:
     imus: dict[str, Imu] = {}
     if "sensor_combined" in topics:
         _put(imus, "/imu", partial(_combined, topics["sensor_combined"]), remarks)
-    for name in sorted(topics):
-        gyro_name, accel_name = re.fullmatch(r"sensor_gyro(?:_fifo)?(?:/(\d+))?", name), name.replace("gyro", "accel")
-        if gyro_name is not None and accel_name in topics:
-            topic = f"/imu/{'fifo' if 'fifo' in name else 'sensor'}{int(gyro_name[1] or 0)}"
-            _put(imus, topic, partial(_pair, topics[name], topics[accel_name]), remarks)
+    sensors = {  # the number is in the name of a topic that has several
+        (match[1], match[2] or "sensor", int(match[3] or 0)): columns
+        for name, columns in topics.items()
+        if (match := re.fullmatch(r"sensor_(gyro|accel)(?:_(fifo))?(?:/(\d+))?", name))
+    }
+    for kind, of, number in sorted(sensors):
+        if kind == "gyro" and (accel := sensors.get(("accel", of, number))) is not None:
+            _put(imus, f"/imu/{of}{number}", partial(_pair, sensors[kind, of, number], accel), remarks)
     if not imus:
         remarks.losses.append("the log has no IMU: neither sensor_combined, nor sensor_gyro and sensor_accel at 10 Hz or more")
     return imus
@@ -122,7 +125,9 @@ def _poses(topics: dict[str, Columns], ending: str, remarks: Remarks) -> Poses |
     attitude, position = topics.get(f"vehicle_attitude{ending}"), topics.get(f"vehicle_local_position{ending}")
     if attitude is None:
         return None
-    q = in_order(_sample_ns(attitude), _vectors(attitude, "q[0] q[1] q[2] q[3]"), f"vehicle_attitude{ending}")
+    turns = _vectors(attitude, "q[0] q[1] q[2] q[3]")
+    turns[~turns.any(axis=1)] = np.nan  # not set yet
+    q = in_order(_sample_ns(attitude), turns, f"vehicle_attitude{ending}")
     remarks.notes.extend(q.notes)
     if not len(q.t_ns):
         return None

@@ -22,7 +22,7 @@ from imutool.errors import DataError
 from . import Sequence
 from ._archive import refusing
 from ._source import find_folders, head
-from ._table_files import kind_of, load
+from ._table_files import NO_NUMBERS, kind_of, load
 from ._table_geodetic import add_local
 from ._table_header import MOSTLY
 from ._table_look import look, recorded_apart
@@ -127,7 +127,8 @@ def load_split(folder: Path, recording: str) -> Columns:
         except DataError as error:
             if path in groups:
                 raise
-            whole.remarks.losses.append(f"{path.name} is left out: it {error.what}")
+            if path.suffix.lower() != ".json" or not error.what.startswith(NO_NUMBERS):  # which is of settings
+                whole.remarks.losses.append(f"{path.name} is left out: it {error.what}")
             continue
         _give_time(part, path, clocks)
         if path in groups:

@@ -43,7 +43,7 @@ def add_local(columns: Columns) -> None:
     if unit and stated in POSITION_SI and np.isfinite(values).all(axis=1).any():
         values[:, :2] *= ANGLE_SI[unit]
         values[:, 2] *= POSITION_SI[stated]
-        for axis, each in zip(("north", "east", "down"), _plane(values).T, strict=True):
+        for axis, each in zip(("north", "east", "down"), plane(values).T, strict=True):
             columns.values[f"{LOCAL}{axis} [m]"] = each
         note = f"{LOCAL}north, {LOCAL}east and {LOCAL}down are {latitude}, {longitude} and {height} about their first"
         columns.remarks.notes.append(f"{note}, in m; the angles are taken for {unit}")
@@ -80,8 +80,8 @@ def _unit(columns: Columns, angles: list[str], values: Float64[np.ndarray, "n 3"
     return "deg" if (known.max(axis=0, initial=0.0) > [np.pi / 2.0, np.pi]).any() else ""
 
 
-def _plane(values: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    """North, east and down (m) of latitude, longitude (rad) and height (m), about the first that is known."""
+def plane(values: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    """North, east, down (m) of latitude, longitude (rad) and height (m), about the first known."""
     latitude, longitude, height = values[np.isfinite(values).all(axis=1)][0]
     bend = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
     east_m = SEMI_MAJOR_M / np.sqrt(bend)

@@ -31,9 +31,18 @@ ROS_IMU = [  # `ros2 topic echo --csv` of sensor_msgs/Imu
     *(f"linear_acceleration.{axis}" for axis in "xyz"),
     *(f"linear_acceleration_covariance{place}" for place in SQUARE),
 ]
+CORE_MOTION = [  # of iOS, as OxIOD has it
+    "time",
+    *(f"attitude_{axis} [rad]" for axis in ("roll", "pitch", "yaw")),
+    *(f"rotation_rate_{axis} [rad/s]" for axis in "xyz"),
+    *(f"gravity_{axis} [g]" for axis in "xyz"),
+    *(f"user_acceleration_{axis} [g]" for axis in "xyz"),
+    *(f"magnetic_field_{axis}" for axis in "xyz"),
+]
 MIN_ROWS, MIN_SHARE = 5, 0.3  # of the lines looked at that have the same words; status lines may stand between
 MIN_TENTH = 0.5  # of the median length, which 90 % of an accelerometer's readings exceed
 MIN_NUMBERS, MIN_LABELS = 4, 2  # in a row
+DIRECTION = 1e-3  # by which rounding changes a direction, or its length of 1
 WIDE, MAX_ROWS = 7, 20_000  # more columns than a time and an IMU; rows that are compared
 LONGEST_LINE, LONGEST_LABEL = 2_000, 80  # characters; the search for labels costs the square of their length
 NUMBER = re.compile(
@@ -128,13 +137,30 @@ def _turning(columns: Columns, names: list[str]) -> _Halves | None:
 def _has_gravity(columns: Columns, triple: list[str], factor: float = 1.0) -> bool:
     """Whether three columns have the size of gravity, and seldom less, as rates of a fast flight about 1 rad/s have.
 
-    Zeros next to a one, as of a pose, have not.
+    A direction, as the row of a rotation, has not, and counts next to a fraction, as of satellites and a latitude.
     """
+    if len({columns.values[name].dtype.kind for name in triple}) > 1:
+        return False
     values = factor * np.stack([columns.values[name].astype(float) for name in triple])
     level, near = gravity_units(columns, triple, factor)
     near = near if factor == 1.0 else [unit for unit in near if unit == "m/s^2"]
     tenth = float(np.nanquantile(np.linalg.norm(values, axis=0), 0.1))
-    return bool(near) and tenth > MIN_TENTH * level and not np.isin(values, (-1, 0, 1)).all()
+    return bool(near) and tenth > MIN_TENTH * level and not _is_direction(columns, triple)
+
+
+def _is_direction(columns: Columns, triple: list[str]) -> bool:
+    """Whether three columns have the length 1 in each row, as an accelerometer that measures g has not."""
+    lengths = np.linalg.norm([columns.values[name].astype(float) for name in triple], axis=0)
+    return bool(np.nanmax(np.abs(lengths - 1.0), initial=0.0) < DIRECTION)
+
+
+def _is_core_motion(columns: Columns, numbered: list[str]) -> bool:
+    """Whether unnamed columns are those of CoreMotion, whose gravity follows from its roll and pitch."""
+    if len(numbered) != len(CORE_MOTION) or not rises(columns.values[numbered[0]]):
+        return False
+    roll, pitch, *gravity = columns.side_by_side([*numbered[1:3], *numbered[7:10]]).T
+    expected = np.cos(pitch) * np.sin(roll), -np.sin(pitch), -np.cos(pitch) * np.cos(roll)
+    return bool(np.nanmax(np.abs(np.stack(gravity) - expected)) < DIRECTION)
 
 
 def _place_of_time(columns: Columns) -> int:
@@ -159,6 +185,8 @@ def name_headerless(columns: Columns) -> None:
         columns.remarks.notes.append("column 2 repeats column 1 and is left out")
     if width == len(ROS_IMU) and [*columns.values] == [*numbered[:2], *numbered[3:]]:
         new, why = ROS_IMU, "it has the columns of `ros2 topic echo --csv` of sensor_msgs/Imu"
+    elif [*columns.values] == numbered and _is_core_motion(columns, numbered):
+        new, why = CORE_MOTION, "it has no header: its columns are those of CoreMotion, as in OxIOD"
     elif [*columns.values] == numbered and (halves := _halves(columns, numbered[_place_of_time(columns) :])):
         count = len(numbered) - len(halves.time) - 6
         if count != _place_of_time(columns):

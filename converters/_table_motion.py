@@ -24,7 +24,7 @@ WITH_GRAVITY = r"(^|_)(raw|specific_?force)(_|$)"
 CORE_MOTION = {  # names of `CMDeviceMotion` on iOS and watchOS, as several programs write them
     "rotation rate": r"(.*_)?rotation_?rate_?(?P<axis>[xyz])",
     "gravity": r"(.*_)?(motion_?)?gravity_?(?P<axis>[xyz])",
-    "acceleration": r"(.*_)?(motion_?)?(user_?)?acceleration_?(?P<axis>[xyz])",
+    "acceleration": r"(.*_)?(motion_?)?((user_?)?acceleration|user_?acc)_?(?P<axis>[xyz])",
 }
 UNIT_BAND = 0.02  # of the length of a gravity in g
 

@@ -82,7 +82,7 @@ PLACES = (  # of several IMUs on a body
 FORMS = (  # names of an axis, by falling preference; one of roll, pitch and yaw may also be that of a command
     rf"(?P<sensor>(?:.*_)?(WORDS)(_(ln|wr))?)_?(?P<axis>[xyz]){STATE}",  # Shimmer has two: low noise and wide range
     rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[012]){STATE}",
-    rf"(?P<of>(?:.*_)?)(?P<axis>[xyz])_(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",
+    rf"(?P<of>(?:.*_)?)(?P<axis>[xyz])_?(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",  # xgyro, of MAVLink
     rf"(?P<sensor>(?:.*_)?(WORDS))_(?P<axis>roll|pitch|yaw){STATE}",
     rf"(?P<axis>roll|pitch|yaw)_?(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",
     rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[xyz])_?(?P<place>\d|{PLACES}|(imu|sensor)_?\d?){STATE}",  # ax1, acc_x_chest

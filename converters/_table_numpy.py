@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import numpy as np
 
 from imutool.errors import DataError
 
+from ._source import head
 from ._table_headerless import name_headerless
 from ._table_mat import check_size
 from ._table_text import WIDEST, Columns
@@ -32,17 +35,32 @@ def load_npz(path: Path, columns: Columns) -> None:
 
 
 def load_npy(path: Path, columns: Columns) -> None:
-    """Add one array, whose columns have no names unless its type states them."""
+    """Add one array, whose columns are named by its type or a file beside it, or not at all."""
     array = read_npy(path)
     if array.dtype.names:
         _add(columns, "", array)
         return
     if array.ndim == 2 and array.shape[0] < array.shape[1]:
         array = array.T
-    for number, column in enumerate(np.atleast_2d(array.T) if array.ndim in (1, 2) else [], 1):
-        if number <= WIDEST:
-            columns.add(f"column {number}", column)
-    name_headerless(columns)
+    each = [*np.atleast_2d(array.T)[:WIDEST]] if array.ndim in (1, 2) else []
+    names = _names_beside(path)
+    named = len({*names}) == len(each)
+    for number, column in enumerate(each):
+        columns.add(names[number] if named else f"column {number + 1}", column)
+    if not named:
+        name_headerless(columns)
+
+
+def _names_beside(path: Path) -> list[str]:
+    """Names of columns in the description beside an array, as TLIO has it: `["ts_us(1)", "qxyzw_World_Device(4)", ...]`."""
+    try:
+        listed = json.loads(head(path.with_name(f"{path.stem}_description.json")))["columns_name(width)"]
+        parts = [(name, int(width.rstrip(")"))) for name, width in (each.split("(") for each in listed)]
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return []
+    axes = {name: "xyzw" if name.startswith("qxyzw") else "xyz" for name, _ in parts}
+    spelled = {name: re.sub("^qxyzw", "quat", name.removesuffix("_World_Device")) for name, _ in parts}
+    return [f"{spelled[name]}_{axis}" if width > 1 else spelled[name] for name, width in parts for axis in axes[name][:width]]
 
 
 def _add(columns: Columns, name: str, array: np.ndarray) -> None:

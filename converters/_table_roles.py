@@ -70,6 +70,8 @@ def role_groups(tables: Names) -> dict[Path, str]:
     shown = [path for path in shown if not re.fullmatch(REFERENCE, words[path])] or shown  # whose rates are no sensor's
     imus = [path for path in tables if re.fullmatch(IMU, words[path]) and path not in true] or shown
     poses = true or [path for path in tables if seen[path].has_poses and path not in shown]
+    if len(poses) == len(shown) == 1 and shown[0] in imus and seen[poses[0]].has_poses:
+        imus = shown  # imu0_resampled of TLIO has poses
     if not poses and len(imus) == len(shown) == 1 and any(seen[path].has_time for path in tables if path not in shown):
         return {shown[0]: IMU_GROUP}
     if len(poses) != 1 or poses[0] in imus:

@@ -1,4 +1,4 @@
-"""ArduPilot DataFlash (.bin, .log): IMUs in FLU, EKF poses as an estimate, every message.
+"""ArduPilot DataFlash (.bin, .log): IMUs in FLU, EKF poses as an estimate, simulated truth.
 
 The log describes its own messages (FMT), in binary or as text with a message a line; no library is needed. ArduPilot measures
 in FRD and its world is NED: the IMU and pose topics are written in FLU and ENU, the other topics keep its own frames. Stamps
@@ -27,12 +27,15 @@ from . import Sequence
 from ._archive import refusing
 from ._dataflash_messages import FMT, FMT_SIZE, HEAD, TEXT_START, Messages, read_messages, text_of
 from ._source import find_files
+from ._table_geodetic import plane
 
 GENERAL = True
 TEMPERATURES = "T", "Temp"  # of the sensor, in degrees Celsius; of older logs the second
 IMU_FIELDS = "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ"
 POSE_FIELDS = "PE", "PN", "PD", "VE", "VN", "VD", "Roll", "Pitch", "Yaw"
 US = 1000  # ns
+TRUTH = "/ground_truth/pose"
+SIMULATED_FIELDS = "Lat", "Lng", "Alt", "Q1", "Q2", "Q3", "Q4"  # in 1e-7 degrees and m; of the simulator SITL alone
 EKF_TYPES = "XKF1", "NKF1", "EKF1"  # of EKF3, of EKF2, and of the EKF of logs before 2016
 
 
@@ -59,14 +62,14 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         metadata["ardupilot/parameters"] = {text_of(r["Name"]): str(float(r["Value"])) for r in messages["PARM"].rows}
     if "MSG" in messages and "Message" in messages["MSG"].fields:
         metadata["ardupilot/messages"] = _said(messages["MSG"])
-    poses = _poses(messages, remarks)
+    poses = _poses(messages, remarks) | _simulated_poses(messages, remarks)
     return MessageLog(
         sequence.name,
         sequence.path.name,
         imus=_imus(messages, remarks),
         poses=poses,
         scalars=_temperatures(messages),
-        kinds=dict.fromkeys(poses, "estimate"),
+        kinds={topic: "truth" if topic == TRUTH else "estimate" for topic in poses},
         tables={f"/{name}": _table(name, group) for name, group in messages.items()},
         metadata=metadata,
         remarks=remarks,
@@ -173,6 +176,22 @@ def _poses(messages: dict[str, Messages], remarks: Remarks) -> dict[str, Poses]:
     q_wb = quaternion.enu_from_ned(quaternion.of_roll_pitch_yaw(np.radians(kept.values[:, 6:])))
     up = np.array([1.0, 1.0, -1.0])
     return {"/ekf/pose": Poses(kept.t_ns, kept.values[:, :3] * up, quaternion.unit(q_wb), kept.values[:, 3:6] * up)}
+
+
+def _simulated_poses(messages: dict[str, Messages], remarks: Remarks) -> dict[str, Poses]:
+    """True poses of a simulated flight in ENU, about the first."""
+    if "SIM" not in messages or not _are_numbers(messages["SIM"], SIMULATED_FIELDS):
+        return {}
+    rows = messages["SIM"].rows
+    values = np.stack([rows[f] for f in SIMULATED_FIELDS], axis=1).astype(float)
+    values[~values[:, 3:].any(axis=1)] = np.nan  # no rotation
+    kept = in_order(messages["SIM"].t_ns, values, TRUTH)
+    remarks.notes.extend(kept.notes)
+    if not len(kept.t_ns):
+        return {}
+    north, east, down = plane(kept.values[:, :3] * [*2 * [np.radians(1e-7)], 1.0]).T
+    q_wb = quaternion.enu_from_ned(quaternion.unit(kept.values[:, 3:]))
+    return {TRUTH: Poses(kept.t_ns, np.stack([east, north, -down], axis=1), quaternion.unit(q_wb))}
 
 
 def _table(name: str, messages: Messages) -> Table:

@@ -27,7 +27,8 @@ FORMATS = {  # what a file that begins like this is, and what to do
     ),
     rb"\x00[\x03-\x07].{6}[\x55\xfd\xfe]": (  # a time in us of 1996 to 2041, then the first byte of a message
         "it is a telemetry log of MAVLink, which has a few samples of the IMU a second",
-        "Convert the vehicle's own log, a .bin or .ulg",
+        "Convert the vehicle's own log, a .bin or .ulg. Without one, write HIGHRES_IMU, or SCALED_IMU2 in mg and mrad/s, as a"
+        " CSV with pymavlink's mavlogdump.py --format csv --types HIGHRES_IMU, and convert that",
     ),
     rb"\xa3\x95\x80": (
         "it is an sdlog2 log of PX4 before 2017",

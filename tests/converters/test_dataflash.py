@@ -223,3 +223,33 @@ def test_the_temperature_of_each_imu_is_a_topic(convert, tmp_path, name, older):
     found = read(tmp_path / "out.mcap", imu="/imu0").scalars["/imu0/temperature"]
     assert (found.unit, len(found.t_ns), found.t_ns[0]) == ("degC", 500, 7_000_000_000)
     np.testing.assert_allclose(found.values[:, 0], 41.0 + 0.01 * np.arange(500), rtol=1e-6)
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_the_truth_of_a_simulated_flight_becomes_true_poses(tmp_path, text):
+    """Message SIM of ArduPilot's simulator: a copter that looks to the east, and goes a hundredth of a minute north and up."""
+    log = DataFlash()
+    log.form(9, "SIM", "QccCfLLffff", "TimeUS,Roll,Pitch,Yaw,Alt,Lat,Lng,Q1,Q2,Q3,Q4")
+    for n in range(3):
+        log.add(
+            "SIM",
+            1000 * n,
+            0,
+            0,
+            9000,
+            584.0 + n,
+            -353_632_621 + 1667 * n,
+            1_491_652_374 - 1000 * n,
+            0.5**0.5,
+            0.0,
+            0.0,
+            0.5**0.5,
+        )
+    path = tmp_path / ("1.log" if text else "1.bin")
+    path.write_text("\n".join([*log.lines, ""])) if text else path.write_bytes(log.raw)
+    flight = dataflash.read_sequence(dataflash.sequences(path)[0])
+    assert flight.kinds == {"/ground_truth/pose": "truth"}
+    poses = flight.poses["/ground_truth/pose"]
+    assert poses.t_ns.tolist() == [0, 1_000_000, 2_000_000]
+    np.testing.assert_allclose(np.abs(poses.q_wb_wxyz), [[1.0, 0.0, 0.0, 0.0]] * 3, atol=1e-7)  # -q is q
+    np.testing.assert_allclose(poses.p_wb[2], [-18.18, 37.0, 2.0], atol=0.02)  # a degree: 90.9 km to the east, 110.96 km north

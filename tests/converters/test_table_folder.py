@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from itertools import accumulate
 from pathlib import Path
@@ -581,6 +582,23 @@ def test_what_lies_beside_an_imu_and_is_not_read_is_named(tmp_path, caplog):
     told = "\n".join(line.getMessage() for line in caplog.records)
     assert "tables that show no IMU are left out: imu0_resampled.npy" in told
     assert "true poses in a folder without an IMU are left out: ground-truth/pose.csv" in told
+
+
+def test_an_array_that_a_description_names_has_the_poses_of_the_imu_beside_it(tmp_path):
+    """As of TLIO, whose array has the IMU in the axes of the world: no sensor's."""
+    names = ["#timestamp [ns]", *(f"w_RS_S_{a} [rad s^-1]" for a in "xyz"), *(f"a_RS_S_{a} [m s^-2]" for a in "xyz")]
+    write_csv(tmp_path / "imu_samples_0.csv", names, [np.rint(1e9 * T_S).astype(np.int64), *GYRO.T, *ACCEL.T])
+    q_xyzw, p = np.tile([0.1, -0.1, 0.7, 0.7], (COUNT, 1)), RNG.normal(0.0, 1.0, (COUNT, 3))
+    np.save(tmp_path / "imu0_resampled.npy", np.column_stack([1e6 * T_S, GYRO, ACCEL, q_xyzw, p, 0.0 * p]))
+    listed = ["ts_us(1)", "gyr_compensated_rotated_in_World(3)", "acc_compensated_rotated_in_World(3)"]
+    listed += ["qxyzw_World_Device(4)", "pos_World_Device(3)", "vel_World(3)"]
+    (tmp_path / "imu0_resampled_description.json").write_text(json.dumps({"columns_name(width)": listed}))
+    log = table.read_sequence(table.sequences(tmp_path)[0])
+    np.testing.assert_array_equal(log.imus["/imu0"].gyro, GYRO)
+    ((topic, poses),) = log.poses.items()
+    assert (log.kinds[topic], len(poses.t_ns), log.remarks.losses) == ("estimate", COUNT, [])
+    np.testing.assert_allclose(poses.q_wb_wxyz[0], [0.7, 0.1, -0.1, 0.7], atol=1e-9)
+    np.testing.assert_allclose(poses.p_wb, p)
 
 
 def test_a_folder_of_matrices_asks_for_a_map_and_takes_it(tmp_path):

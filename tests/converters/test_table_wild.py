@@ -264,19 +264,30 @@ def test_the_fields_of_a_microstrain_sensor_have_the_units_of_its_protocol(tmp_p
     np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G)
 
 
-@pytest.mark.parametrize("named", ["rotationRate{}|gravity{}|acceleration{}", "rotationRate.{}|gravity.{}|userAcceleration.{}"])
+@pytest.mark.parametrize(
+    "named",
+    [
+        "rotationRate{}|gravity{}|acceleration{}",
+        "rotationRate.{}|gravity.{}|userAcceleration.{}",
+        "rotation_rate_{}(radians/s)|gravity_{}(G)|user_acc_{}(G)",
+        "",
+    ],
+)
 def test_gravity_beside_an_acceleration_of_coremotion_is_added_to_it(tmp_path, named):
-    """As Sensor Logger writes the motion of an Apple watch."""
+    """As Sensor Logger writes the motion of an Apple watch, and OxIOD that of a phone, without a header."""
     t_s, rng = np.arange(1000) * 0.01, np.random.default_rng(4)
     angles = np.stack([2.0 * t_s, 0.8 * np.sin(1.3 * t_s), 1.1 * t_s], axis=1)  # turns over and over
     gravity = -Rotation.from_euler("xyz", angles).inv().apply([0.0, 0.0, 1.0])
     motion, gyro = rng.normal(0.0, 0.9, (2, 1000, 3))
+    parts = {form: v for form, v in zip(named.split("|"), (gyro, gravity, motion), strict=False) if form}
     columns = {
-        form.format(axis): each
-        for form, v in zip(named.split("|"), (gyro, gravity, motion), strict=True)
-        for axis, each in zip("XYZ" if "." not in named else "xyz", v.T, strict=True)
+        f.format(a): each for f, v in parts.items() for a, each in zip("XYZ" if "." not in f else "xyz", v.T, strict=True)
     }
     path = write_csv(tmp_path / "WristMotion.csv", ["t [s]", *columns], [t_s, *columns.values()])
+    if not named:
+        attitude = np.arctan2(gravity[:, 0], -gravity[:, 2]), -np.arcsin(gravity[:, 1]), t_s
+        rows = np.column_stack([t_s, *attitude, gyro, gravity, motion, 40.0 * gravity])
+        path.write_text("\n".join(",".join(map(repr, row)) for row in rows.tolist()) + "\n")
     log = table.read_sequence(table.sequences(path)[0], mapping={"gyro_unit": "rad/s"})
     np.testing.assert_allclose(log.imus["/imu0"].accel, -9.80665 * (gravity + motion), rtol=1e-9)
     np.testing.assert_array_equal(log.imus["/imu0"].gyro, gyro)
@@ -473,6 +484,14 @@ def test_the_motion_shows_which_columns_of_a_wide_table_are_the_imu(tmp_path):
         read(tmp_path / "imu.csv")
     assert '# perhaps accel = ["column 12", "column 13", "column 14"]' in str(caught.value)
     assert '# perhaps gyro = ["column 9", "column 10", "column 11"]' in str(caught.value)
+    poses = np.insert(turn.as_matrix().reshape(-1, 9), [3, 6, 9], 331_000.0, axis=1).tolist()
+    gps = [[3, 9, 0.738 + t, -1.461, 270.0, 0.0, 0.0] for t in t_s.tolist()]  # of NCLT: mode, satellites, latitude
+    for others in (poses, gps):
+        lines = (",".join(map(repr, [t, *row])) for t, row in zip(t_s.tolist(), others, strict=True))
+        (tmp_path / "other.csv").write_text("\n".join(lines) + "\n")
+        with pytest.raises(ConfigError) as caught:
+            read(tmp_path / "other.csv")
+        assert "perhaps" not in str(caught.value)
 
 
 def test_axes_in_letters_come_before_numbered_columns_of_the_same_word(tmp_path):
@@ -480,6 +499,24 @@ def test_axes_in_letters_come_before_numbered_columns_of_the_same_word(tmp_path)
     columns = [1e3 * T_S, *ACCEL_G.T, *(COUNTS * 0.07).T, *RNG.normal(600, 9, (3, COUNT))]
     path = write_csv(tmp_path / "audio.csv", names, columns)
     np.testing.assert_allclose(read(path).imus["/imu0"].accel, 9.80665 * ACCEL_G, rtol=1e-12)
+
+
+def test_the_axis_may_stand_in_front_as_in_messages_of_mavlink(tmp_path):
+    """As mavlogdump.py of pymavlink writes them."""
+    names = ["timestamp", *(f"HIGHRES_IMU.{a}{sensor}" for sensor in ("acc", "gyro", "mag") for a in "xyz")]
+    imu = read(write_csv(tmp_path / "highres.csv", names, [T_S, *ACCEL_G.T, *(COUNTS * 0.07).T, *ACCEL_G.T])).imus["/imu0"]
+    np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, rtol=1e-12)
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(COUNTS * 0.07), rtol=1e-12)
+
+
+def test_the_poses_of_idol_are_those_of_its_table(tmp_path):
+    sensors = [f"iphone{sensor}{a}" for sensor in ("Acc", "Gyro") for a in "XYZ"]
+    names = ["timestamp", *sensors, *(f"orient{a}" for a in "WXYZ"), *(f"processedPos{a}" for a in "XYZ")]
+    columns = [T_S, *ACCEL_G.T, *(COUNTS * 0.07).T, *np.full((4, COUNT), 0.5), *ACCEL_G.T]
+    log = read(write_csv(tmp_path / "idol.csv", names, columns))
+    ((topic, poses),) = log.poses.items()
+    assert (log.kinds[topic], poses.q_wb_wxyz.tolist()) == ("estimate", [[0.5] * 4] * COUNT)
+    np.testing.assert_array_equal(poses.p_wb, ACCEL_G)
 
 
 def test_a_first_column_of_row_numbers_hides_no_time(tmp_path):

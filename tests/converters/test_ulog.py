@@ -60,6 +60,27 @@ def test_every_instance_is_an_imu_on_the_gyros_stamps(log):
     assert second.t_ns[0] == (START_US + 4000) * 1000  # the first gyro sample has no accelerometer sample ahead of it
 
 
+def test_a_gyro_of_several_pairs_with_the_only_accelerometer(tmp_path):
+    writer = Ulog()
+    for sensor, instances in (("sensor_gyro", (0, 1)), ("sensor_accel", (0,))):
+        for instance in instances:
+            rows = [(t, t, 1.0 + instance, 0.0, -9.75, 25.0) for t in range(5_000_000, 6_000_000, 4000)]
+            writer.topic(sensor, SENSOR, rows, instance)
+    (sequence,) = ulog.sequences(writer.write(tmp_path / "log.ulg"))
+    (imu,) = ulog.read_sequence(sequence).imus.values()
+    assert np.array_equal(imu.gyro[:, 0], np.ones(250))
+
+
+def test_an_attitude_of_zeros_costs_its_own_pose_alone(tmp_path):
+    """As PX4 has it before the estimator or the simulator set one."""
+    writer, times = Ulog(), range(5_000_000, 6_000_000, 4000)
+    writer.topic("vehicle_attitude", ATTITUDE, [(t, float(t > 5_000_000), 0.0, 0.0, 0.0) for t in times])
+    (sequence,) = ulog.sequences(writer.write(tmp_path / "log.ulg"))
+    log = ulog.read_sequence(sequence)
+    assert len(log.poses["/ekf/pose"].t_ns) == 249
+    assert any("1 samples that are not finite are left out" in note for note in log.remarks.notes)
+
+
 def test_every_topic_parameter_and_text_arrives(log):
     with log.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
