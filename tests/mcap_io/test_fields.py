@@ -323,7 +323,7 @@ WIDE = b"".join(LEVEL)  # 100^20 fields
         (b"string[100000] s\nfloat64 x\n", CDR + bytes(400_000), "texts and counts"),
         (b"wstring s\nfloat64 x\n", CDR + bytes(64), "wide string"),
         (b"float64 x\n", b"", "plain CDR"),
-        (b"float64 x\n", b"\0\7\0\0" + bytes(8), "plain CDR"),
+        (b"float64 x\n", b"\0\x09\0\0" + bytes(8), "plain CDR"),
         (b"float64 x\n", CDR + bytes(5), "ends before"),
         (b"what is? this\n", CDR + bytes(8), "has the line 'what is"),
         (b"\xff\xfe\0", CDR + bytes(8), "has the line"),
