@@ -30,7 +30,7 @@ from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.storage.target import copy_file
 from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES
 from imutool.recording.message_log import Message, MessageLog
-from imutool.units import AXES
+from imutool.units import AXES, SENSORS
 
 MAX_ROUNDS = 4  # quaternions first, then the clock of poses, which hides a turned body, which hides a wrong world
 AS_RECORDED = np.stack([np.eye(3)] * 2)  # axes of gyro and accel
@@ -111,8 +111,8 @@ def _gyro_axes(log: Log, topic: str, pose_topic: str) -> Float64[np.ndarray, "3 
 
 def _imu_note(survey: Survey) -> str:
     gyro, accel = (axis_names(P) for P in survey.axes)
-    scale = f"gyro times {survey.scale[0]:.9g}, accel times {survey.scale[3]:.9g}"
-    return f"{scale}; x, y, z are now {gyro} of gyro and {accel} of accel as recorded"
+    sizes = [f"{sensor} times {size:.9g}" for sensor, size in zip(SENSORS, survey.scale[::3], strict=True) if size != 1.0]
+    return "; ".join([", ".join(sizes)] * bool(sizes) + [f"x, y, z are now {gyro} of gyro and {accel} of accel as recorded"])
 
 
 def write_corrected(
