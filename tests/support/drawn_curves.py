@@ -14,7 +14,7 @@ from rerun.chunk import RrdReader
 
 from support import saved_rrd
 
-MIN = 100  # pixels of a curve, of which others may leave the edges: 150; its sample in a legend has some fifty
+MIN = 200  # pixels of a curve; its sample in a legend has some fifty
 WITHIN = 36.0  # in RGB: what an edge mixes of a line with its ground, and less than two colours of ours are apart
 MAX_COLORS = 12  # of one path: its neighbours are near each other
 MARKS = ("/worst", "/error_vec")  # no curves: a body may hide a mark, and where nothing is wrong a vector has no length

@@ -10,7 +10,7 @@ from imutool.recording import Imu, Recording, Scalars
 from imutool.sensor.made_up_flight import ACCEL_BIAS, GYRO_BIAS, flight
 from imutool.viewing.model.run_data import Run
 
-OFF = np.array([0.06, -0.12, 0.18, 1.2, -1.8, 2.4])  # rad/s, m/s²: what raw is off by, next to the flight's own bias
+OFF = np.array([-0.08, -0.12, 0.18, 1.2, -1.8, 2.4])  # rad/s, m/s²: error of raw, added to the flight's bias (-0.05 in x)
 NOISE = np.array([0.01, 0.01, 0.01, 0.1, 0.1, 0.1])  # rad/s, m/s²: of raw alone, so that its spectrum lies above
 LEFT, SIGMA = 0.2, 0.1  # of that: what a model leaves, and what it says that it may be wrong by
 DURATION_S = 8.0
