@@ -198,7 +198,8 @@ def native(
     port = free_port()
     options = ["--headless", "--bind", "127.0.0.1", "--port", str(port), "--memory-limit", memory, "--hide-welcome-screen"]
     line = [str(binary()), *map(str, files), *options, "--window-size", f"{window[0]}x{window[1]}"]
-    environment = {**os.environ, "RERUN_APP_ONLY": "true", **dict.fromkeys(CHOSEN, str(found))}
+    environment = {**os.environ, "RERUN_APP_ONLY": "true", "RUST_LOG": "error", **dict.fromkeys(CHOSEN, str(found))}
+    # at other levels of its log it lays notices of its start over the views for some seconds
     environment |= {} if path is None else {"PATH": path}
     with tempfile.TemporaryFile() as said:
         process = subprocess.Popen(line, env=environment, stdin=subprocess.DEVNULL, stdout=said, stderr=subprocess.STDOUT)
