@@ -32,7 +32,7 @@ test: $(READY_TEST)  ## format, lint, then every test with warnings as errors, t
 	@$(BIN)/ruff check .
 	@echo "test: mypy --strict, and next to it viewers and pytest"
 	@$(BIN)/python -m mypy & types=$$!; \
-	$(BIN)/python tests/support/viewers.py; \
+	$(BIN)/python tests/support/viewers.py || exit 1; \
 	$(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist worksteal; tests=$$?; \
 	wait $$types || { echo "test: mypy found what it says above" >&2; exit 1; }; exit $$tests
 
