@@ -27,11 +27,12 @@ demo: $(READY_DEMO)  ## the whole way on a made-up recording: convert, train, de
 	@echo "demo: runs on made-up flights; everything goes to $(DEMO)"
 	@$(BIN)/imutool demo --output $(DEMO) --overwrite
 
-test: viewers  ## format, lint, then every test with warnings as errors, types beside them
+test: $(READY_TEST)  ## format, lint, then every test with warnings as errors, types beside them
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
-	@echo "test: mypy --strict and pytest, side by side"
+	@echo "test: mypy --strict, and next to it viewers and pytest"
 	@$(BIN)/python -m mypy & types=$$!; \
+	$(BIN)/python tests/support/viewers.py || exit 1; \
 	$(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist worksteal; tests=$$?; \
 	wait $$types || { echo "test: mypy found what it says above" >&2; exit 1; }; exit $$tests
 

@@ -135,7 +135,13 @@ def test_a_simulation_without_gravity_is_told(
     accel = ideal.imu.accel - R_bw.apply([0.0, 0.0, 9.81])
     write(begin(replace(ideal, imu=replace(ideal.imu, accel=accel), truths={})), tmp_path / "weightless.mcap")
     write(begin(replace(recorded, truths={})), tmp_path / "real.mcap")
-    diagnose([tmp_path / "real.mcap"], tmp_path / "weightless.mcap")
+
+    def until_the_search(done: int, total: int, text: str) -> None:
+        if done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        diagnose([tmp_path / "real.mcap"], tmp_path / "weightless.mcap", tell=until_the_search)
     assert [
         line
         for line in caplog.messages

@@ -124,20 +124,18 @@ class _Whole(HTMLParser):
             assert self.open.pop() == tag
 
 
-def test_a_second_run_skips_all_and_a_changed_log_is_done_again(
-    fleet: Path, engine: Workers, settings: Settings, tmp_path: Path
-) -> None:
+def test_a_second_run_skips_all_and_a_changed_log_is_done_again(fleet: Path, settings: Settings, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    run(str(fleet), str(out), settings, engine)
+    run(str(fleet), str(out), settings, Inline)
     before = {path: (path.stat().st_mtime_ns, path.stat().st_ino) for path in out.rglob("*.mcap")}
     with pytest.raises(ConfigError, match="`resume`"):
         run(str(fleet), str(out), settings, Idle)
-    again = run(str(fleet), str(out), settings, engine, resume=True)
+    again = run(str(fleet), str(out), settings, Inline, resume=True)
     assert dict(again.progress.statuses) == {"skipped": 2}
     assert {row["earlier"] for row in rows(out).values()} == {"ok"}
     assert {path: (path.stat().st_mtime_ns, path.stat().st_ino) for path in out.rglob("*.mcap")} == before
     shutil.copy(fleet / "robot_a" / "log.mcap", fleet / "robot_b" / "log.mcap")
-    changed = run(str(fleet), str(out), settings, engine, resume=True)
+    changed = run(str(fleet), str(out), settings, Inline, resume=True)
     assert dict(changed.progress.statuses) == {"skipped": 1, "ok": 1}
     assert len(set(digests(out).values())) == 1
 
@@ -159,29 +157,29 @@ def test_a_run_that_begins_anew_and_is_interrupted_leaves_no_table_of_the_one_be
         assert (out / "fleet.parquet").exists() == ("resume" in words)
 
 
-def test_somebody_elses_file_stays(fleet: Path, engine: Workers, tmp_path: Path) -> None:
+def test_somebody_elses_file_stays(fleet: Path, tmp_path: Path) -> None:
     theirs = tmp_path / "out" / "robot_a" / "log.json"
     theirs.parent.mkdir(parents=True)
     theirs.write_text("theirs")
-    report = run(str(fleet), str(tmp_path / "out"), INFO, engine)
+    report = run(str(fleet), str(tmp_path / "out"), INFO, Inline)
     assert (theirs.read_text(), dict(report.progress.statuses)) == ("theirs", {"failed": 1, "ok": 1})
     assert "the target exists" in report.not_whole[0].error
-    assert dict(run(str(fleet), str(tmp_path / "out"), INFO, engine, overwrite=True).progress.statuses) == {"ok": 2}
+    assert dict(run(str(fleet), str(tmp_path / "out"), INFO, Inline, overwrite=True).progress.statuses) == {"ok": 2}
     assert theirs.read_text() != "theirs"
 
 
 def test_a_target_of_which_every_note_was_hit_is_kept_and_with_overwrite_it_alone_is_done_again(
-    fleet: Path, engine: Workers, tmp_path: Path
+    fleet: Path, tmp_path: Path
 ) -> None:
     """Nothing says any more that the fleet wrote it; `resume` with `overwrite` goes on all the same."""
     out = tmp_path / "out"
-    run(str(fleet), str(out), INFO, engine)
+    run(str(fleet), str(out), INFO, Inline)
     journal, before = out / NAME, sorted((path, path.read_bytes()) for path in out.rglob("*.json"))
     journal.write_bytes(journal.read_bytes().replace(b"robot_a", b"r\0b\0t_a"))
-    kept = run(str(fleet), str(out), INFO, engine, resume=True)
+    kept = run(str(fleet), str(out), INFO, Inline, resume=True)
     assert dict(kept.progress.statuses) == {"failed": 1, "skipped": 1}
     assert "robot_a/log.json: the target exists" in kept.not_whole[0].error
-    again = run(str(fleet), str(out), INFO, engine, resume=True, overwrite=True)
+    again = run(str(fleet), str(out), INFO, Inline, resume=True, overwrite=True)
     assert dict(again.progress.statuses) == {"ok": 1, "skipped": 1}
     assert sorted((path, path.read_bytes()) for path in out.rglob("*.json")) == before
 
@@ -362,7 +360,7 @@ def test_a_killed_worker_takes_its_log_alone(
     if workers == 1:
         assert statuses == {"ok": LOGS - 1, "failed": 1}
         assert "its worker died, also where it ran alone (Killed)" in report.not_whole[0].error
-        again = run(str(many), str(out), settings, lambda: ProcessEngine(workers=2), resume=True)
+        again = run(str(many), str(out), settings, Inline, resume=True)
         assert dict(again.progress.statuses) == {"skipped": LOGS - 1, "ok": 1}
     else:
         assert statuses == {"ok": LOGS}
@@ -380,7 +378,6 @@ def test_a_fleet_that_is_ended_goes_on_where_it_was(
     logs: Path,
     tmp_path: Path,
     end: str,
-    engine: Workers,
     settings: Settings,
     expected: dict[str, str],
 ) -> None:
@@ -405,7 +402,7 @@ def test_a_fleet_that_is_ended_goes_on_where_it_was(
     kept = {path: path.stat().st_mtime_ns for path in out.glob("*.mcap")}
     with (out / NAME).open("ab") as journal:
         journal.write(b'{"line":"done","key":"to')  # as a driver does that is killed while it writes
-    report = run(str(many), str(out), settings, engine, resume=True)
+    report = run(str(many), str(out), settings, Inline, resume=True)
     assert report.progress.statuses.total() == LOGS
     assert report.progress.statuses["skipped"] >= done - 1  # the last one may not have come into the journal
     assert report.progress.exit_code == 0

@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import rerun as rr
+from support import saved_rrd
 
+from imutool.recording import Recording
+from imutool.viewing.model.load_view import build
+from imutool.viewing.model.run_data import Run, RunData
 from imutool.viewing.rerun import sdk
-from tests.viewing.rerun import test_pixels
-
-HERE = Path(__file__).parent
+from tests.viewing.rerun import test_pixels, test_scene
 
 Plant = Callable[[pytest.MonkeyPatch], None]
 SCALE, LATE_NS = 1.001, 1
@@ -60,49 +63,37 @@ def late(timeline: str) -> Plant:
 
 
 PATH, SERIES = without("world/debiased/path"), without("error/position/debiased")
-MUTANTS = {"path dropped": PATH, "series dropped": SERIES, "scaled": scaled} | {
-    f"late on {name}": late(name) for name in sdk.TIMELINES
+ENTITIES, CURVES = (
+    test_scene.test_the_file_holds_exactly_the_entities_it_should,
+    test_scene.test_every_curve_reads_back_bit_for_bit_with_its_nanoseconds,
+)
+MUTANTS = {"path dropped": (PATH, ENTITIES), "series dropped": (SERIES, CURVES), "scaled": (scaled, CURVES)} | {
+    f"late on {name}": (late(name), CURVES) for name in sdk.TIMELINES
 }
-CURVES_READ_BACK = "test_every_curve_reads_back_bit_for_bit_with_its_nanoseconds"
-CATCHERS = {"path dropped": "test_the_file_holds_exactly_the_entities_it_should", "series dropped": CURVES_READ_BACK} | {
-    name: CURVES_READ_BACK for name in MUTANTS if name not in ("path dropped", "series dropped")
-}
 
 
-class Outcomes:
-    """What became of each test of a run within a test."""
-
-    def __init__(self) -> None:
-        self.failed: dict[str, str] = {}
-        self.passed: list[str] = []
-
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        name = report.nodeid.rpartition("::")[2]
-        if report.failed:
-            self.failed[name] = report.longreprtext
-        elif report.when == "call":
-            self.passed.append(name)
+@pytest.fixture
+def read_back(recording: Recording, runs: list[Run], tmp_path: Path) -> Callable[[], tuple[RunData, SimpleNamespace]]:
+    """Writes what test_scene.py looks at, and reads it back."""
+    one = test_scene.filled(build(recording, [runs[0], runs[2]]))
+    return lambda: (one, SimpleNamespace(all=saved_rrd.read(saved_rrd.written([one], tmp_path / "one.rrd"))))
 
 
-def run(name: str) -> Outcomes:
-    """One test of test_scene.py, in this process, so that what is planted here is there."""
-    found = Outcomes()
-    alone = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--override-ini", "addopts=--import-mode=importlib"]
-    pytest.main([*alone, f"{HERE / 'test_scene.py'}::{name}"], plugins=[found])
-    return found
-
-
-@pytest.mark.parametrize("name", sorted(set(CATCHERS.values())))
-def test_without_a_wrong_the_tests_pass(name: str) -> None:
-    assert run(name).passed == [name]
+def test_without_a_wrong_the_tests_pass(read_back: Callable[[], tuple[RunData, SimpleNamespace]]) -> None:
+    found = read_back()
+    for test in (ENTITIES, CURVES):
+        test(*found)
 
 
 @pytest.mark.parametrize("wrong", MUTANTS)
-def test_a_wrong_in_what_is_logged_fails_the_test_that_reads_it_back(wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    MUTANTS[wrong](monkeypatch)
-    found = run(CATCHERS[wrong])
-    assert list(found.failed) == [CATCHERS[wrong]]
-    assert "AssertionError" in found.failed[CATCHERS[wrong]] or "KeyError" in found.failed[CATCHERS[wrong]]
+def test_a_wrong_in_what_is_logged_fails_the_test_that_reads_it_back(
+    wrong: str, read_back: Callable[[], tuple[RunData, SimpleNamespace]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant, catcher = MUTANTS[wrong]
+    plant(monkeypatch)
+    found = read_back()
+    with pytest.raises((AssertionError, KeyError)):
+        catcher(*found)
 
 
 def test_what_is_missing_is_missing_among_the_pixels(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
