@@ -63,15 +63,15 @@ def other_conditions(model: BiasModel, samples: tuple[Float64[np.ndarray, " n"],
     """Sentences on noise and rate of some samples that the training logs did not have."""
     sentences = []
     steps = np.diff(samples[0])
-    shorter, period_s, longer = (float(quantile(steps, share)) for share in (0.25, 0.5, 0.75))
+    margin = min(0.5, 0.5 * SURE / math.sqrt(len(steps)))  # of the median's rank, however the steps scatter
+    shortest, period_s, longest = (float(quantile(steps, share)) for share in (0.5 - margin, 0.5, 0.5 + margin))
     noise = white_noise(np.concatenate([samples[1], samples[2]], axis=1), period_s)
     known = model.noise_std > 0
     ratio = float((noise[known] / model.noise_std[known]).max()) if known.any() else 0.0
     if ratio > MAX_NOISE:  # less noise is no doubt: a drone in the hand has a tenth of that in flight
         sentences.append(f"the samples are {ratio:.0f} times as noisy as in the training runs: another sensor, or vibration")
-    rate_hz, scatter = 1.0 / period_s, (longer - shorter) / period_s / math.sqrt(len(steps))  # of the median of uneven steps
-    if model.rate_hz and abs(rate_hz / model.rate_hz - 1.0) > MAX_RATE + SURE * scatter:
-        sentences.append(f"samples at {rate_hz:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
+    if model.rate_hz and not (1.0 - MAX_RATE) / longest < model.rate_hz < (1.0 + MAX_RATE) / shortest:
+        sentences.append(f"samples at {1.0 / period_s:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
     return sentences
 
 

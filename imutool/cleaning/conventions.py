@@ -76,8 +76,7 @@ def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventio
             carried = _against_gravity(step, mean, gyro.axes)
         forces = _force_at_poses(step, force, motion.middle_ns, poses)
         accel, up, unit, other = _accel_against_poses(forces, gyro, carried)
-        vertical = _mean_vertical(forces)
-        conventions = Conventions(truth.topic, gyro, accel, carried, up, delay, unit, what or other, vertical)
+        conventions = Conventions(truth.topic, gyro, accel, carried, up, delay, unit, what or other, _mean_vertical(forces))
         turned = quaternion.rotate(forces.q_wb, forces.f @ gyro.axes.T) if gyro is not None else forces.f[:0]
         level = len(turned) > 0 and axis_of_gravity(turned) == "+z"
         found.append((conventions, (up == "+z", accel is not None, level)))
@@ -99,8 +98,7 @@ def _rate_readings(fast: float) -> list[tuple[str, Float64[np.ndarray, "3 3"]]]:
 def _reading(choice: Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:
     unit, matrix = readings[choice.best]
     as_is = next(row for row, (name, M) in enumerate(readings) if name == unit and (RATES[unit] * np.eye(3) == M).all())
-    misfits = float(choice.misfit[choice.best]), float(choice.misfit[as_is])
-    return Reading(np.round(matrix / RATES[unit]), unit, choice.certain, *misfits)
+    return Reading(np.round(matrix / RATES[unit]), unit, choice.certain, *choice.misfit[[choice.best, as_is]].tolist())
 
 
 def _against_gravity(
@@ -230,8 +228,8 @@ def _rates(
 
 def _nearest(choice: Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:
     """The reading nearest to the log's axes among those that fit about as well as the best; it is no proposal."""
-    close = choice.misfit < choice.misfit.min() / CLEARLY
-    good = [row for row in np.flatnonzero(close).tolist() if readings[row][0] == readings[choice.best][0]]
+    close = np.flatnonzero(choice.misfit < choice.misfit.min() / CLEARLY).tolist()
+    good = [row for row in close if readings[row][0] == readings[choice.best][0]]
     nearest = max(good, key=lambda row: float(np.trace(readings[row][1])), default=choice.best)
     return _reading(choice._replace(best=nearest), readings)._replace(sole=False)
 
@@ -283,17 +281,20 @@ def _accel_against_poses(
     misfit = np.zeros((0, 3)) if choice is None else misfits.of(1.0, choice.best)
     if straight and is_other_world(f, q_wb, a_w, misfit, blocks):
         return None, None, unit, OTHER_WORLD
-    in_mean = axis_of_gravity(quaternion.rotate(q_wb, f)) if straight else None
+    contradicted = relative is not None and relative.wrong  # then the mean force is in other axes than the gyro's
+    in_mean = axis_of_gravity(quaternion.rotate(q_wb, f)) if straight and not contradicted else None
     if choice is None or choice.misfit[choice.best] > CLEARLY * GRAVITY_M_S2:
         return None, in_mean, unit, ""
-    P, up = readings[choice.best]
+    rows = sorted(np.flatnonzero(choice.alike).tolist(), key=lambda row: row != choice.best)
+    if contradicted and gyro is not None and gyro.sole:  # a mirrored accel in a world z down fits alike
+        rows = [row for row in rows if np.linalg.det(readings[row][0]) > 0.0 and readings[row][1][2] > 0.0] or rows
+    P, up = readings[rows[0]]
     if straight and up[2] < 0.0 and (np.diag([1.0, 1.0, -1.0]) == P).all() and stays_level(q_wb):  # mirrored, it fits alike
         return None, in_mean, unit, ""
     as_is = float(np.sqrt(median(np.sum((a_w + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb, f)) ** 2, axis=1))))
-    alike = [readings[row] for row in np.flatnonzero(choice.alike).tolist()]
-    one_axes = all((other == P).all() for other, _ in alike)
-    found = Reading(P, "m/s^2", choice.certain, float(choice.misfit[choice.best]), as_is) if one_axes else None
-    named = axis_of_gravity(GRAVITY_M_S2 * up[None]) if all((up == other).all() for _, other in alike) else in_mean
+    one_axes, one_up = (all((readings[row][part] == readings[rows[0]][part]).all() for row in rows) for part in (0, 1))
+    found = Reading(P, "m/s^2", choice.certain, float(choice.misfit[rows[0]]), as_is) if one_axes else None
+    named = axis_of_gravity(GRAVITY_M_S2 * up[None]) if one_up else in_mean
     if not straight and (gyro is None or not gyro.sole):  # without turns about two axes a proposal has no evidence
         return found if found is not None and found.as_is else None, named if named == "+z" else None, unit, ""
     return found, named, unit, ""

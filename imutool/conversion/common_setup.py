@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.cleaning.pose_delay import LONGEST_DELAY_S, StepIntegral, lateness, usable
+from imutool.cleaning.pose_delay import LONGEST_DELAY_S, StepIntegral, lateness, pose_delay, usable
 from imutool.cleaning.samples import STEP_NS, STEP_S, Motion
 from imutool.cleaning.truth import Truth, read_truth, turning
 from imutool.cleaning.unit_evidence import POSES_APART_NS
@@ -71,15 +71,16 @@ def shared(own: Mapping[int, Corrections]) -> tuple[Corrections, list[int]]:
 def _agreed(logs: Sequence[Corrections]) -> Corrections:
     """What most of the logs that are corrected in a point agree on, point by point."""
     topics = dict.fromkeys(chain.from_iterable(each.imus for each in logs))
+    found = {topic: most_alike([each.imus[topic] for each in logs if topic in each.imus], np.allclose) for topic in topics}
+    imus = {topic: matrices for topic, matrices in found.items() if matrices is not None}
     pose_topic = most_alike([each.pose_topic for each in logs if each.pose_topic]) or ""
-    of_poses = [each for each in logs if each.pose_topic == pose_topic != ""]
+    of_poses = [each for each in logs if each.pose_topic == pose_topic != "" and _corrects(each, imus)]
     worlds = [each.world for each in of_poses if not _is_identity(each.world)]
     turns = [each.body.turn for each in of_poses if not _is_identity(each.body.turn)]
     late = _group([each.late_ns for each in of_poses if each.late_ns], lambda a, b: abs(a - b) < ALIKE_NS)
     world = most_alike(worlds, np.array_equal)
-    found = {topic: most_alike([each.imus[topic] for each in logs if topic in each.imus], np.allclose) for topic in topics}
     return Corrections(
-        imus={topic: matrices for topic, matrices in found.items() if matrices is not None},
+        imus=imus,
         world=np.eye(3) if world is None else world,
         late_ns=round(median(np.array(late, float))) if late else 0,
         body=Body(_mean(_group(turns, lambda a, b: _angle(a, b) < ALIKE_RAD)), frozenset()),
@@ -87,6 +88,11 @@ def _agreed(logs: Sequence[Corrections]) -> Corrections:
         unit=most_alike([each.unit for each in of_poses if each.unit != "m"]) or "m",
         quaternions=most_alike([each.quaternions for each in of_poses if each.quaternions]) or "",
     )
+
+
+def _corrects(log: Corrections, imus: Mapping[str, Float64[np.ndarray, "2 3 3"]]) -> bool:
+    """Whether a log corrects IMUs so: what another shows of its poses may come from an IMU that is not corrected."""
+    return all(topic in log.imus and np.allclose(log.imus[topic], matrices) for topic, matrices in imus.items())
 
 
 def _lacks(own: Corrections, common: Corrections) -> bool:
@@ -176,13 +182,17 @@ def _mean(turns: Sequence[Float64[np.ndarray, "3 3"]]) -> Float64[np.ndarray, "3
 def contradicts_delay(log: Log, imu_topic: str, pose_topic: str, late_s: float) -> bool:
     """Whether poses that are not late by `late_s` fit the gyro clearly better.
 
-    The correlation of the rates is that under the best rotation between the body of the poses and the gyro.
+    A delay that the log shows itself decides: it is nearer to `late_s`, or to none. Where it shows none, the correlation of the
+    rates is that under the best rotation between the body of the poses and the gyro.
     """
     motion, truth = Motion(), read_truth(log, topics=[pose_topic])
     for samples in ImuSamples(log, imu_topic):
         motion.see(samples)
     if truth is None or len(motion.table()[0]) < FEWEST_TURNS:
         return False
+    own = pose_delay(motion, truth)
+    if own is not None and own.step is None:
+        return abs(own.seconds - late_s) > abs(own.seconds)
     return any(_contradicts(motion, truth, late_s, spacing) for spacing in APART)
 
 

@@ -198,7 +198,7 @@ def motion_warnings(topic: str, explained: float, rms_rad_s: float, jumps: int, 
         return []
     often = "once" if jumps == 1 else f"{jumps} times"
     text = f"the poses {topic} turn by up to {largest_deg:.0f}° in 0.1 s that the gyro does not show, {often}"
-    return [f"{text}: markers that were exchanged or hidden, a gyro at the end of its range, or clocks that differ"]
+    return [f"{text}: markers that were exchanged or hidden, a gyro that stands still or is clipped, or clocks that differ"]
 
 
 def sparse_warnings(poses: Truth) -> list[str]:

@@ -274,6 +274,15 @@ def test_another_rate_is_a_doubt_where_the_steps_show_it(
     assert ("Hz, in the training runs at" in " ".join(found.reasons)) == is_doubt, found
 
 
+def test_steps_of_two_lengths_are_no_doubt_of_the_rate(model: BiasModel, recording: Recording) -> None:
+    """A host stamps each sample at one of two of its ticks: the median step is the one or the other by chance."""
+    imu, period_ns = recording.imu, 1e9 * recording.imu.period_s
+    longer = np.random.default_rng(6).permutation(len(imu)) < 0.502 * len(imu)
+    t_ns = imu.t_ns[0] + np.cumsum(np.where(longer, 1.02, 0.98) * period_ns).astype(np.int64)
+    found = judged(model, Imu(t_ns, imu.gyro, imu.accel))
+    assert "Hz, in the training runs at" not in " ".join(found.reasons), found
+
+
 def test_an_unfit_model_is_refused_unless_forced_and_a_doubtful_one_is_used(
     model: BiasModel, recording: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -438,6 +438,24 @@ def test_wheel_odometry_of_another_frame_is_no_evidence() -> None:
     assert found.up in (None, "+z")
 
 
+@pytest.mark.parametrize("of_gyro", [np.eye(3), PERMUTATIONS[17]])
+def test_axes_of_an_accel_that_contradict_the_gyro_are_named_by_poses_without_positions(of_gyro: np.ndarray) -> None:
+    """As raw columns in the order of a circuit board: gyro z, x, y, and the accelerometer turned by half a turn about z."""
+    imu, poses = turned(waves(60.0, (0.3, 0.3, 0.3)))
+    recorded = Imu(imu.t_ns, imu.gyro @ of_gyro, imu.accel * [-1.0, -1.0, 1.0])
+    truth = of_poses("/vicon", poses)
+    assert truth is not None
+    found = judge(motion_of(recorded), truth, 1.0)
+    assert found.gyro is not None
+    assert found.accel is not None
+    np.testing.assert_array_equal(found.gyro.axes, of_gyro)
+    np.testing.assert_array_equal(found.accel.axes, np.diag([-1.0, -1.0, 1.0]))
+    assert found.up == "+z"
+    fixed = looked(recorded, truth, fix=True)
+    np.testing.assert_array_equal(fixed.axes, [of_gyro, np.diag([-1.0, -1.0, 1.0])])
+    np.testing.assert_array_equal(fixed.world, np.eye(3))
+
+
 @pytest.mark.parametrize("seed", [2, 3])
 def test_inverse_quaternions_are_seen_though_those_as_recorded_share_the_yaw(seed: int) -> None:
     """A drone whose IMU lies on its back: the inverse yaws as its gyro does, and leaves no sure order of the axes."""

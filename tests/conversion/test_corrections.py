@@ -276,6 +276,29 @@ def test_a_log_whose_poses_have_another_delay_does_not_get_that_of_the_others(tm
             assert any(note.startswith(said) and note.endswith("which its own motion contradicts") for note in notes), name
 
 
+def test_a_small_delay_that_a_log_shows_is_not_replaced_by_a_larger_one_of_the_others(tmp_path: Path) -> None:
+    """Two sessions of one setup: the clocks differ by less than two delays of one session may."""
+    made = flight(3, duration_s=40.0, rate_hz=100.0, truth_rate_hz=50.0)
+    (tmp_path / "in").mkdir()
+    for name, late_ms in {"first": 27, "second": 27, "other": 6}.items():
+        late = replace(made.truth, t_ns=made.truth.t_ns + late_ms * 1_000_000)
+        write(replace(made, truths={"/vicon/pose": late}), tmp_path / "in" / f"{name}.mcap")
+    convert(tmp_path / "in", tmp_path / "out", fix=True, workers=1)
+    for name, left_ms in {"first": 0, "second": 0, "other": 6}.items():
+        left_ns = read(tmp_path / "out" / f"{name}.mcap").truth.t_ns - made.truth.t_ns
+        assert np.abs(left_ns - left_ms * 1_000_000).max() < 3_000_000, name
+
+
+def test_what_logs_show_of_poses_by_an_imu_that_others_correct_is_not_shared() -> None:
+    """An accelerometer in other axes than its gyro makes the world of the poses look turned, where the log shows no more."""
+    turned, world = np.stack([P, np.eye(3)]), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    right, misled = Corrections({"/imu0": turned}, pose_topic="/p"), Corrections(world=world, pose_topic="/p")
+    common, lacking = shared({0: right, 1: right, 2: misled, 3: misled, 4: misled})
+    np.testing.assert_array_equal(common.imus["/imu0"], turned)
+    np.testing.assert_array_equal(common.world, np.eye(3))
+    assert lacking == [2, 3, 4]
+
+
 def test_logs_share_what_most_of_those_that_show_anything_agree_on() -> None:
     degrees, turned = np.stack([np.radians(1.0) * np.eye(3), np.eye(3)]), np.stack([P, P])
     shows, shows_other, shows_nothing = Corrections({"/imu0": degrees}), Corrections({"/imu0": turned}), Corrections()
