@@ -1,22 +1,76 @@
-"""Checkpoint of a training: tensors in safetensors, the rest in its JSON header."""
+"""Trainings with a checkpoint on the way: tensors in safetensors, the rest in its JSON header."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from imutool.bias import neural_ode
 from imutool.bias.model_file import read_tensors, write_tensors
 from imutool.config import plain
 from imutool.errors import ConfigError, ModelError
-from imutool.training.fit import Stage, Training
+from imutool.recording import Recording
+from imutool.training.fit import Epoch, Stage, Training
 from imutool.training.objectives.objective import RobustLoss
-from imutool.units import SENSORS
+from imutool.training.objectives.paper_scheme import PaperTraining
+from imutool.training.settings import TrainSettings
+from imutool.units import SENSORS, Sensor
 
 FORMAT = "imutool.training/3"
+
+
+def checkpoint_path(out: Path) -> Path:
+    """Where the checkpoint of a training that will write `out` lies."""
+    return out.with_name(f"{out.name}.checkpoint")
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Trainings to their end, with a checkpoint on the way."""
+
+    kept: Path
+    resume: bool
+    device: str
+    say: Callable[[Epoch], None]
+
+    def __call__(
+        self,
+        recordings: Sequence[Recording],
+        method: str,
+        settings: TrainSettings,
+        constant: Collection[Sensor] = (),
+        *,
+        closed: Collection[Sensor] = (),
+        checkpointed: bool = True,
+        statistics: bool = True,
+    ) -> Training:
+        """Training of a method, whose `closed` sensors stay in closed form."""
+        paper = method == neural_ode.Model.method and settings.model.get("scheme") == "paper"
+        training = (PaperTraining if paper else Training)(recordings, method, settings, self.device, constant, closed)
+        checkpointed = checkpointed and training.model.iterative
+        if checkpointed:
+            if self.resume:
+                restore(training, self.kept)
+            else:
+                self.kept.unlink(missing_ok=True)
+        try:
+            for epoch in training.epochs(statistics=statistics):
+                self.say(epoch)
+                if checkpointed and epoch.step:
+                    save(training, self.kept)
+        except KeyboardInterrupt as interrupt:  # it may have struck in the middle of a step: what is kept is from before
+            if self.kept.exists():
+                raise KeyboardInterrupt(
+                    f"{self.kept} holds what is done; the same command with `resume` goes on from there"
+                ) from interrupt
+            raise
+        return training
 
 
 def save(training: Training, path: Path) -> None:

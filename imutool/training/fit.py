@@ -95,7 +95,7 @@ def check_device(device: str) -> None:
 class Training:
     """Training of one model on one sensor; `model` is final once `epochs` has ended.
 
-    The `constant` sensors get no matrix in closed form.
+    The `constant` sensors get no matrix in closed form, and the `closed` ones no descent after it.
 
     Raises:
         DataError: recordings without truth, of different rates, too short, or standing still.
@@ -109,8 +109,9 @@ class Training:
         settings: TrainSettings | None = None,
         device: str = "cpu",
         constant: Collection[Sensor] = (),
+        closed: Collection[Sensor] = (),
     ) -> None:
-        self.settings, self._constant = settings_for(method, settings), constant
+        self.settings, self._constant, self._closed = settings_for(method, settings), constant, closed
         check_device(device)
         self.pool = Pool.of(recordings, device=device, floors=self.settings.pose_floors)
         torch.manual_seed(self.settings.seed)
@@ -222,7 +223,8 @@ class Training:
             loss = self._one_step(stage)
 
     def _steps(self, sensor: Sensor) -> int:
-        return self.settings.steps if self.model.iterative and self._moved(sensor) else 0
+        descends = self.model.iterative and sensor not in self._closed
+        return self.settings.steps if descends and self._moved(sensor) else 0
 
     def _rate_at(self, stage: Stage) -> float:
         sensor, warm = stage.sensor, min(1.0, (stage.step + 1) / WARM_UP_STEPS)

@@ -15,31 +15,26 @@ outliers and the attitude under the accelerometer stay those of all logs (`tests
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from imutool.array_types import Bool, Float64
-from imutool.bias import static
+from imutool.array_types import Float64
 from imutool.bias.model import BiasModel
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.temperature import Scale
-from imutool.bias_start.bias_from_truth import TRUTH_S, poses_turn_alone
-from imutool.bias_start.correction import apply
-from imutool.bias_start.model_choice import bound_to, estimate_at_rest, find_initial_bias, smooth_in_memory
-from imutool.errors import DataError, ModelError
-from imutool.geometry import quaternion
-from imutool.inertial import metrics
-from imutool.inertial.strapdown import along_truth, drift
+from imutool.bias_start.bias_from_truth import poses_turn_alone
+from imutool.bias_start.model_choice import bound_to
 from imutool.processes.forked import of_each
-from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
+from imutool.recording import Recording, nanoseconds
 from imutool.training.calibration.effect_selection import Calibration, parameter_columns
 from imutool.training.calibration.log_scatter import MIN_GAIN, SURELY
 from imutool.training.candidates import CANDIDATES, best_predicted, known, left_out_effects, left_out_model, with_statistics
 from imutool.training.log_agreement import Contradiction, check_axes, contradicting
+from imutool.training.log_scores import STARTS, Score, score_of, scores_of
 from imutool.training.log_signals import without_nuisances
 from imutool.training.settings import LINEAR, TrainSettings
 from imutool.training.training_windows import Pool
@@ -47,27 +42,9 @@ from imutool.units import Sensor
 
 logger = logging.getLogger(__name__)
 
-STARTS = ("auto", "smooth", "truth")
 CHANCE = 0.3  # least deviation of a sum of gains over logs, in logarithms of errors, that candidates without a true effect have
 MIN_ERROR = 1e-6  # ° or m/s
 LONGEST_S = 120.0  # of a log that is scored
-MAX_OF_LOG = 0.5  # that a start from the truth takes: scored on the same seconds, a constant would explain all of them
-DRIFT_S = 5.0
-
-
-@dataclass(frozen=True)
-class Score:
-    """Errors of a left-out log with one model and start.
-
-    AOE (°), and after 5 s from the truth those of the velocity (m/s) and the attitude (°).
-    """
-
-    log: str
-    model: str
-    start: str
-    aoe_deg: float
-    drift_m_s: float | None
-    drift_deg: float | None = None
 
 
 class Criterion(NamedTuple):
@@ -113,6 +90,11 @@ class Comparison:
         """Sensors for which a constant bias is enough."""
         return {sensor for sensor, kept in self.kept.items() if kept == CANDIDATES[0]}
 
+    def with_scores(self, scores: Sequence[Score]) -> Comparison:
+        """Comparison with the scores of one more candidate, the least simple."""
+        known = (*self.scores, *scores)
+        return replace(self, scores=known, kept={sensor: keep(known, sensor) for sensor in self.kept})
+
     def card(self) -> dict[str, Any]:
         """Entry of a model card."""
         scores, contradicting = ([vars(entry) for entry in entries] for entries in (self.scores, self.contradicting))
@@ -147,11 +129,10 @@ def compare(
         models = {c: bound_to(model, recording) for c, model in left_out.items()}
         log = _without_nuisances(recording, fits["gyro"], (), index)
         alone = poses_turn_alone(log.imu, log.truth)
-        scores = [_score(log, "raw", "", log.imu, alone)]
-        scores += [_score(log, "static", start, imu, alone) for start in STARTS for imu in _corrected(log, None, start)]
+        scores = [score_of(log, "raw", "", log.imu, alone), *scores_of(log, "static", None, alone)]
         for name, model in models.items():
             log = _without_nuisances(recording, fits["gyro"], effects[name]["gyro"], index)
-            scores += [_score(log, name, start, imu, alone) for start in STARTS for imu in _corrected(log, model, start)]
+            scores += scores_of(log, name, model, alone)
         return scores
 
     logs = list(enumerate(_logs(recordings, pool, fits["gyro"])))
@@ -164,6 +145,28 @@ def compare(
     for warning in better_without(scores, kept["gyro"]):
         logger.warning("%s", warning)
     return Comparison(tuple(scores), kept, parts, contradictions)
+
+
+def network_scores(
+    name: str,
+    trained_on: Callable[[Sequence[int]], BiasModel],
+    recordings: Sequence[Recording],
+    pool: Pool,
+    fits: Mapping[Sensor, Calibration],
+) -> list[Score]:
+    """Scores of a network on every log, trained on every other log without it.
+
+    A network needs as long for each log left out as for all of them, so there are two trainings in place of many.
+    """
+    scores = []
+    logs = list(_logs(recordings, pool, fits["gyro"]))
+    for first in (0, 1):
+        model = trained_on(range(1 - first, len(logs), 2))
+        for index in range(first, len(logs), 2):
+            alone = poses_turn_alone(logs[index].imu, logs[index].truth)
+            log = _without_nuisances(logs[index], fits["gyro"], LINEAR["gyro"], index)
+            scores += scores_of(log, name, bound_to(model, log), alone)
+    return scores
 
 
 def better_without(scores: Sequence[Score], kept: str) -> Iterator[str]:
@@ -182,7 +185,7 @@ def keep(scores: Sequence[Score], sensor: Sensor) -> str:
     For the gyro `static` counts as the simplest. Where it beats all candidates, the first is kept.
     """
     logs = list(dict.fromkeys(score.log for score in scores))
-    present = [candidate for candidate in CANDIDATES if any(score.model == candidate for score in scores)]
+    present = [name for name in dict.fromkeys(score.model for score in scores) if name not in WITHOUT_TRAINING]
     table = {
         (model, criterion): _log_errors(scores, logs, model, criterion)
         for model in ("static", *present)
@@ -259,38 +262,3 @@ def _logs(recordings: Sequence[Recording], pool: Pool, fit: Calibration) -> Iter
             start_ns = begin_ns + nanoseconds(first) if part > 1 else int(recording.imu.t_ns[0])
             name = recording.name if parts == 1 else f"{recording.name} {part}/{parts}"
             yield replace(recording, name=name, imu=recording.imu.between(start_ns, end_ns))
-
-
-def _corrected(log: Recording, model: BiasModel | None, start: str) -> list[Imu]:
-    """Samples corrected by a model, or by the log's own rest bias; empty if the log has no start of this kind."""
-    try:
-        if model is None and start == "auto":
-            static_model, initial = estimate_at_rest(log.imu, log.name)
-            return [apply(static_model, initial, log.imu).imu]
-        model = model or static.Model()
-        if start == "smooth":
-            return [apply(model, smooth_in_memory(model, log.imu, log.name), log.imu).imu]
-        truth_s = min(TRUTH_S, MAX_OF_LOG * float(seconds(log.imu.t_ns[-1:], int(log.imu.t_ns[0]))[0]))
-        initial = find_initial_bias(f"truth:{truth_s}" if start == "truth" else start, model, log)
-        return [apply(model, initial, log.imu).imu]
-    except (DataError, ModelError):
-        return []
-
-
-def _score(log: Recording, model: str, start: str, imu: Imu, alone: Bool[np.ndarray, " n"]) -> Score:
-    imu = _turned_as_poses(imu, log.truth, alone[np.searchsorted(log.imu.t_ns, imu.t_ns)])
-    path, truth, valid = along_truth(imu, log.truth, log.name)
-    drifted = drift(path, truth, valid, DRIFT_S)
-    drift_m_s, drift_rad = (
-        float(np.sqrt(np.mean(x**2))) if len(x) else None for x in (drifted.velocity_m_s, drifted.orientation_rad)
-    )
-    drift_deg = None if drift_rad is None else float(np.degrees(drift_rad))
-    aoe_deg = float(metrics.absolute(path, truth, valid)["aoe_deg"] or 0.0)
-    return Score(log.name, model, start, aoe_deg, drift_m_s if truth.has_positions else None, drift_deg)
-
-
-def _turned_as_poses(imu: Imu, truth: Poses, rows: Bool[np.ndarray, " n"]) -> Imu:
-    """Samples whose gyro turns as the poses do in some rows, by the rule of `dead_reckon`."""
-    poses, dt = truth.at(imu.t_ns)[0], np.diff(seconds(imu.t_ns, int(imu.t_ns[0])))  # interpolated over gaps
-    turns = quaternion.log(quaternion.multiply(quaternion.inverse(poses.q_wb_wxyz[:-1]), poses.q_wb_wxyz[1:]))
-    return replace(imu, gyro=np.concatenate([np.where(rows[:-1, None], turns / dt[:, None], imu.gyro[:-1]), imu.gyro[-1:]]))

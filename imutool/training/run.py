@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,16 +27,16 @@ from imutool.log_info.convention_report import check_conventions
 from imutool.mcap_io.storage.local import is_stream
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
-from imutool.training import checkpoint
 from imutool.training.calibration.effect_selection import DRIFTS, Calibration, PhysicsFirst, config_of
 from imutool.training.calibration.filter_settings import filter_settings
 from imutool.training.calibration.log_scatter import MIN_GAIN, SURELY
+from imutool.training.calibration.normal_equations import FOLDS
 from imutool.training.candidates import left_out_covariance, simpler_effects
+from imutool.training.checkpoint import Descent, checkpoint_path
 from imutool.training.fit import Epoch, Training, check_device, note
-from imutool.training.left_out import MIN_ERROR, beaten, compare
+from imutool.training.left_out import MIN_ERROR, Comparison, beaten, compare, network_scores
 from imutool.training.log_agreement import warn_of_smoothed_poses
 from imutool.training.log_signals import matrix_covariance, read_parts, with_poses_of_sensor
-from imutool.training.objectives.paper_scheme import PaperTraining
 from imutool.training.settings import LINEAR, TrainSettings, settings_for
 from imutool.training.training_windows import Pool, check_trainable
 from imutool.units import SENSORS, Sensor
@@ -45,11 +44,6 @@ from imutool.units import SENSORS, Sensor
 logger = logging.getLogger(__name__)
 
 LogErrors = Mapping[Sensor, Float64[np.ndarray, " logs"]]
-
-
-def checkpoint_path(out: Path) -> Path:
-    """Where the checkpoint of a training that will write `out` lies."""
-    return out.with_name(f"{out.name}.checkpoint")
 
 
 @settings_of_a_new_process()
@@ -104,7 +98,7 @@ def train(
         names = ", ".join(recording.name for recording in recordings if not recording.truth.has_positions)
         what = "the true poses of %s have no positions: the gyro alone is trained, and the accelerometer turned with it"
         logger.warning(what, names)
-    descent = _Descent(kept, resume, device, progress or (lambda epoch: None))
+    descent = Descent(kept, resume, device, progress or (lambda epoch: None))
     trainer: Trainer = TRAINERS[method] if method in TRAINERS else partial(_network_alone, method)
     with side_by_side():
         model, about = trainer(recordings, chosen, descent)
@@ -115,47 +109,8 @@ def train(
     return model_file.load(out)
 
 
-@dataclass(frozen=True)
-class _Descent:
-    """Runs a training to its end, with a checkpoint on the way."""
-
-    kept: Path
-    resume: bool
-    device: str
-    say: Callable[[Epoch], None]
-
-    def __call__(
-        self,
-        recordings: Sequence[Recording],
-        method: str,
-        settings: TrainSettings,
-        constant: Collection[Sensor] = (),
-        *,
-        statistics: bool = True,
-    ) -> Training:
-        paper = method == neural_ode.Model.method and settings.model.get("scheme") == "paper"
-        training = (PaperTraining if paper else Training)(recordings, method, settings, self.device, constant)
-        if training.model.iterative:
-            if self.resume:
-                checkpoint.restore(training, self.kept)
-            else:
-                self.kept.unlink(missing_ok=True)
-        try:
-            for epoch in training.epochs(statistics=statistics):
-                self.say(epoch)
-                if training.model.iterative and epoch.step:
-                    checkpoint.save(training, self.kept)
-        except KeyboardInterrupt as interrupt:  # it may have struck in the middle of a step: what is kept is from before
-            if self.kept.exists():
-                raise KeyboardInterrupt(
-                    f"{self.kept} holds what is done; the same command with `resume` goes on from there"
-                ) from interrupt
-            raise
-        return training
-
-
 def _physics_first(
-    recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent
+    recordings: Sequence[Recording], settings: TrainSettings, descent: Descent
 ) -> tuple[BiasNetwork, dict[str, Any]]:
     """Effects as far as they help left-out logs, then the neural ODE where it helps; the card's entries for both."""
     physics = PhysicsFirst.of(recordings, settings, descent.device, descent.say)
@@ -189,7 +144,7 @@ def _physics_first(
 
 
 def _drift_first(
-    recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent
+    recordings: Sequence[Recording], settings: TrainSettings, descent: Descent
 ) -> tuple[BiasNetwork, dict[str, Any]]:
     """Drift behind the load as far as it helps left-out logs, then the neural ODE; the card's entries."""
 
@@ -238,33 +193,58 @@ def _described(fits: Mapping[Sensor, Calibration]) -> dict[str, Any]:
     return {s: {"effects": list(f.effects), "gains": dict(f.gains), "unseen": list(f.unseen)} for s, f in fits.items()}
 
 
-def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent) -> tuple[BiasNetwork, dict[str, Any]]:
+def _closed_forms(
+    recordings: Sequence[Recording], settings: TrainSettings, descent: Descent
+) -> tuple[Mapping[Sensor, Calibration], Comparison]:
+    """Constant bias, scale and misalignment on left-out logs."""
+    descent.say(note("scoring left-out logs"))
+    names = {f"{sensor}_effects": LINEAR[sensor] for sensor in SENSORS}
+    shared = {name: getattr(settings, name) for name in TrainSettings.__struct_fields__}
+    physics = PhysicsFirst.of(recordings, TrainSettings(**shared | {"model": names}), descent.device, lambda epoch: None)
+    without = descent(physics.recordings, static.Model.method, TrainSettings(**shared | {"model": {}}))
+    pool = Pool.of(recordings, floors=settings.pose_floors)
+    return physics.fits, compare(recordings, pool, physics.fits, without.model, settings)
+
+
+def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: Descent) -> tuple[BiasNetwork, dict[str, Any]]:
     """A matrix for each sensor whose matrix helps left-out logs; the card's entries."""
     compared, constant = dict[str, Any](), set[Sensor]()
     if settings.compare:
-        descent.say(note("scoring left-out logs"))
-        names = {f"{sensor}_effects": LINEAR[sensor] for sensor in SENSORS}
-        hybrid_settings = msgspec.structs.replace(settings, model=names)
-        physics = PhysicsFirst.of(recordings, hybrid_settings, descent.device, lambda epoch: None)
-        without = descent(physics.recordings, static.Model.method, msgspec.structs.replace(settings, model={}))
-        pool = Pool.of(recordings, floors=settings.pose_floors)
-        comparison = compare(recordings, pool, physics.fits, without.model, settings)
+        fits, comparison = _closed_forms(recordings, settings, descent)
         compared, constant = {"left_out": comparison.card()}, comparison.constant
     training = descent(recordings, linear.Model.method, settings, constant)
     for sensor in constant:
-        training.model.take_covariance(sensor, matrix_covariance(left_out_covariance(physics.fits[sensor], sensor)))
+        training.model.take_covariance(sensor, matrix_covariance(left_out_covariance(fits[sensor], sensor)))
     return training.model, _about(training) | compared
 
 
 def _network_alone(
-    method: str, recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent
+    method: str, recordings: Sequence[Recording], settings: TrainSettings, descent: Descent
 ) -> tuple[BiasNetwork, dict[str, Any]]:
-    """Network without effects; the card's entries."""
-    training = descent(recordings, method, settings)
-    return training.model, _about(training)
+    """Network, as far as left-out logs do not refute it; the card's entries.
+
+    The last fifths of logs that each show one motion confirm a network that harms other motions.
+    """
+    if not settings.compare or len(recordings) < FOLDS:
+        training = descent(recordings, method, settings)
+        return training.model, _about(training)
+    fits, comparison = _closed_forms(recordings, settings, descent)
+
+    def trained_on(logs: Sequence[int]) -> BiasModel:
+        descent.say(note("training on half of the logs"))
+        half = descent([recordings[index] for index in logs], method, settings, checkpointed=False)
+        model = half.model.frozen()
+        model.card = {"logs": [{}] * len(logs), **_about(half), **filter_settings(model, half.pool)}
+        return model
+
+    pool = Pool.of(recordings, floors=settings.pose_floors)
+    comparison = comparison.with_scores(network_scores(method, trained_on, recordings, pool, fits))
+    refuted = {sensor for sensor, kept in comparison.kept.items() if kept != method}
+    training = descent(recordings, method, settings, comparison.constant, closed=refuted)
+    return training.model, _about(training) | {"left_out": comparison.card()}
 
 
-Trainer = Callable[[Sequence[Recording], TrainSettings, _Descent], tuple[BiasNetwork, dict[str, Any]]]
+Trainer = Callable[[Sequence[Recording], TrainSettings, Descent], tuple[BiasNetwork, dict[str, Any]]]
 TRAINERS: dict[str, Trainer] = {"hybrid": _physics_first, "linear": _linear, "neural_ode": _drift_first}
 
 

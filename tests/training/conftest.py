@@ -23,7 +23,7 @@ PERFECT = TriadSettings(
 def one_start() -> Iterator[None]:
     """Left-out logs are scored from one start of three: finding starts is most of a small training, and proved elsewhere."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("imutool.training.left_out.STARTS", ("truth",))
+        patched.setattr("imutool.training.log_scores.STARTS", ("truth",))
         yield
 
 

@@ -20,7 +20,7 @@ from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
 from imutool.training.calibration.effect_selection import PhysicsFirst
 from imutool.training.candidates import with_statistics
 from imutool.training.fit import Training
-from imutool.training.left_out import _score, _turned_as_poses
+from imutool.training.log_scores import score_of, turned_as_poses
 from imutool.training.run import train
 from imutool.training.settings import LINEAR, settings_of
 from imutool.training.training_windows import Pool
@@ -86,7 +86,7 @@ def test_turns_that_the_gyro_does_not_show_count_for_no_candidate() -> None:
     with_gap = replace(made, imu=made.imu.rows((t < 12.0) | (t > 13.0)))
     nothing = np.zeros(len(with_gap.imu), bool)
     shown, hidden = (
-        _score(with_gap, "raw", "", with_gap.imu, rows) for rows in (nothing, poses_turn_alone(with_gap.imu, made.truth))
+        score_of(with_gap, "raw", "", with_gap.imu, rows) for rows in (nothing, poses_turn_alone(with_gap.imu, made.truth))
     )
     assert shown.aoe_deg > 10.0
     assert hidden.aoe_deg < 0.5
@@ -104,6 +104,6 @@ def test_poses_that_jump_and_come_back_cost_no_candidate_more_than_the_jump(hidd
     jumped = quaternion.multiply(made.truth.q_wb_wxyz, quaternion.exp(away))
     truth = replace(made.truth, q_wb_wxyz=jumped).rows((t < 12.0 - hidden_s) | (t > 12.0))
     rows = poses_turn_alone(made.imu, truth)
-    path, true, _ = along_truth(_turned_as_poses(made.imu, truth, rows), made.truth, "made")
+    path, true, _ = along_truth(turned_as_poses(made.imu, truth, rows), made.truth, "made")
     off = quaternion.log(quaternion.multiply(quaternion.inverse(path.q_wb_wxyz), true.q_wb_wxyz))
     assert np.degrees(np.linalg.norm(off[path.t_ns > made.truth.t_ns[-1] - 10**10], axis=1)).max() < 5.0

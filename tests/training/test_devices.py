@@ -23,9 +23,10 @@ from imutool.bias.networks.network import Segment
 from imutool.bias.neural_ode import Config
 from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
+from imutool.training.checkpoint import checkpoint_path
 from imutool.training.fit import Epoch, Training
 from imutool.training.objectives.objective import AdamW
-from imutool.training.run import checkpoint_path, train
+from imutool.training.run import train
 from imutool.training.settings import TrainSettings, settings_of
 
 pytestmark = pytest.mark.usefixtures("one_start")  # left-out logs are scored in numpy, on whatever device was trained

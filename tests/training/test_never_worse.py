@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.switchings_on import Switchings, log
 
+from imutool.bias.model import BiasModel
 from imutool.config import load
 from imutool.errors import DataError
 from imutool.evaluation import evaluate
@@ -18,10 +21,10 @@ from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.training.calibration.effect_selection import calibrate
-from imutool.training.left_out import Score, beaten, better_without, keep
+from imutool.training.left_out import Score, beaten, better_without, keep, network_scores
 from imutool.training.log_agreement import Contradiction, check_axes, contradicting
 from imutool.training.run import train
-from imutool.training.settings import LINEAR, settings_of
+from imutool.training.settings import LINEAR, full_name, settings_of
 from imutool.training.training_windows import Pool
 
 KIND = Switchings(sensor_seed=0, rest_s=10.0, duration_s=30.0, rate_hz=50.0)
@@ -227,6 +230,40 @@ def test_a_network_does_not_learn_what_belongs_to_the_poses_of_each_log(tmp_path
     assert not model.config.remainder, model.card["compared"]
     _, static, trained = (r["aoe_deg"] for r in evaluate(paths[3], models=["static", str(tmp_path / "m.safetensors")]))
     assert trained < 1.1 * static
+
+
+@pytest.mark.parametrize(("factor", "kept"), [(0.3, "conv"), (3.0, "constant")])
+def test_a_network_stays_if_left_out_logs_confirm_it(
+    tmp_path: Path, one_start: None, monkeypatch: pytest.MonkeyPatch, factor: float, kept: str
+) -> None:
+    """A sensor without any error but its bias; the scores of the network on other logs are made up."""
+    kind = msgspec.structs.replace(KIND, rest_s=5.0, scale=0.0, misalignment_rad=0.0)
+    paths = [tmp_path / f"{seed}.mcap" for seed in range(4)]
+    for seed, path in enumerate(paths):
+        write(log(seed, 0, kind), path)
+    halves = list[list[int]]()
+
+    def scored(
+        name: str, trained_on: Callable[[Sequence[int]], BiasModel], recordings: Sequence[Recording], *rest: Any
+    ) -> list[Score]:
+        def counted(half: Sequence[int]) -> BiasModel:
+            halves.append([*half])
+            return trained_on(half)
+
+        found = network_scores(name, counted, recordings, *rest)
+        assert [score.log for score in found] == [recordings[index].name for index in (0, 2, 1, 3)]
+        return [
+            replace(score, aoe_deg=factor * index, drift_m_s=factor, drift_deg=factor) for index, score in enumerate(found, 1)
+        ]
+
+    monkeypatch.setattr("imutool.training.run.network_scores", scored)
+    tiny = ["steps=20", "samples=400", "validate_every=20", "channels=[4,8]", "dilations=[1,4]"]
+    words = [full_name("conv", word) for word in tiny]
+    model = train(paths, tmp_path / "m.safetensors", method="conv", settings=load(settings_of("conv"), None, words))
+    assert halves == [[1, 3], [0, 2]]
+    assert model.card["left_out"]["kept"]["gyro"] == kept
+    learned = np.abs(model.tensors["net.gyro.out"]).max()
+    assert (learned > 0.0) == (kept == "conv")
 
 
 def with_lever_arm(recording: Recording, arm_m: np.ndarray) -> Recording:

@@ -26,10 +26,11 @@ from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.made_up_flight import flight
 from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.calibration.effect_selection import config_of
+from imutool.training.checkpoint import checkpoint_path
 from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.log_signals import TRIADS_RAD, read_parts
 from imutool.training.objectives.objective import AdamW, WindowEndObjective
-from imutool.training.run import checkpoint_path, helps, train
+from imutool.training.run import helps, train
 from imutool.training.settings import settings_from_physics, settings_of
 from imutool.units import Sensor
 
