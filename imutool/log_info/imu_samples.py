@@ -41,6 +41,7 @@ class ImuSamples:
         sound: stamps of the samples.
         frames: messages by the frame that they name.
         stamps, jumps: faults of the stamps, and jumps of their clock.
+        unsorted: whether the stamps increase once the messages are in order of log time.
     """
 
     def __init__(self, log: Log, topic: str) -> None:
@@ -55,7 +56,7 @@ class ImuSamples:
         self._lag_ns = np.inf, -np.inf  # of the log times behind the stamps
         self.frames = FrameCounts()
         recorded, self.sound = SensorStamps(), IncreasingStamps()
-        self.stamps, messages, finite = NO_FAULTS, 0, 0
+        self.stamps, self.unsorted, messages, finite = NO_FAULTS, False, 0, 0
         for samples in blocks(counted_frames(raw_batches(log, topic), self.frames)):
             good = measured(samples.values)
             recorded.see(samples.stamp_ns)
@@ -83,11 +84,12 @@ class ImuSamples:
 
     def _hold_stamps(self) -> None:
         """Reads all stamps into memory, and settles the order of the samples."""
-        parts = [(samples.stamp_ns.copy(), measured(samples.values)) for samples in self._read()]
-        t_ns = np.concatenate([np.zeros(0, np.int64), *(stamps for stamps, _ in parts)])
-        rows = np.flatnonzero(np.concatenate([np.zeros(0, bool), *(good for _, good in parts)]))
+        parts = [(samples.stamp_ns.copy(), samples.log_ns.copy(), measured(samples.values)) for samples in self._read()]
+        t_ns, log_ns = (np.concatenate([np.zeros(0, np.int64), *(part[column] for part in parts)]) for column in (0, 1))
+        rows = np.flatnonzero(np.concatenate([np.zeros(0, bool), *(good for *_, good in parts)]))
         self.stamps, self.jumps, self.recorded = read_stamps(t_ns), clock_jumps(t_ns), sorted_stamps(t_ns)
-        self.counts["out_of_order"] = int((t_ns < np.maximum.accumulate(t_ns)).sum()) if len(t_ns) else 0
+        self.counts["out_of_order"] = behind = _out_of_order(t_ns)
+        self.unsorted = behind > 0 and _out_of_order(t_ns[np.argsort(log_ns, kind="stable")]) == 0
         self.counts["duplicated"] = len(t_ns) - len(distinct(t_ns))
         line = distinct(restamped(t_ns) if self.stamps.batch > 1.0 or self.stamps.fraction else t_ns)
         self.counts["missing"] = int(missing(line, usual_period(line), ticked(line)).sum()) if len(line) > 1 else 0
@@ -156,3 +158,8 @@ class ImuSamples:
                 of[(of < a) | (samples.stamp_ns > last_ns[of])] = -1
                 for stretch in np.flatnonzero(np.bincount(of[of >= 0])).tolist():  # unlike `unique`, without masked arrays
                     yield stretch, samples.values[of == stretch]
+
+
+def _out_of_order(t_ns: Int64[np.ndarray, " n"]) -> int:
+    """Stamps that come after a later one."""
+    return int((t_ns < np.maximum.accumulate(t_ns)).sum()) if len(t_ns) else 0
