@@ -240,8 +240,8 @@ def _other_bias(found: _Evidence, prior: BiasPrior, maximum: Vector6) -> Iterato
         axis = int(np.argmax(deviations[columns])) + columns.start
         if deviations[axis] > maximum[axis]:
             yield (
-                f"the {sensor}'s bias about {'xyz'[axis % 3]} differs by {found.difference[axis]:+.2g} {unit} from the training"
-                f" runs, {deviations[axis]:.0f} standard deviations: another unit, or another turn-on"
+                f"the {sensor}'s bias about {'xyz'[axis % 3]} differs by {found.difference[axis]:+.2g} {unit} from the model's"
+                f" prior, {deviations[axis]:.0f} standard deviations: another unit, or another turn-on"
             )
 
 
@@ -292,7 +292,7 @@ def _same_unit(model: BiasModel, about: Mapping[str, str]) -> bool:
 def _agreement(found: _Evidence, prior: BiasPrior, share: Share) -> str:
     """Sentence on a log that agrees with a model, and on what it does not show."""
     maximum = _deviations(found, prior).max()
-    agrees = f"the bias that the log shows lies within {maximum:.1f} standard deviations of the training runs"
+    agrees = f"the bias that the log shows lies within {maximum:.1f} standard deviations of the model's prior"
     if math.isinf(share.std):  # nothing is corrected in motion
         return agrees
     return f"{agrees}; {_shown_share(share) if share.std <= HALF else 'it does not show the share of the correction in motion'}"

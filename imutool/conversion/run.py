@@ -101,7 +101,9 @@ def convert(
         if packed.root is not None:
             found.add(_find(packed.content, format, Path(out)), packed)
         if not found.names():
-            raise nothing_found(packed.content, packed=packed.root is not None)
+            error = nothing_found(packed.content, packed=packed.root is not None)
+            advice = error.fix or "Leave `format` out: then the recording is recognised"
+            raise error if format == AUTO else error.replaced(expected=f"a recording of the format {format}", fix=advice)
         report = _convert_found(found, source, out, sequences, template, workers, progress)
         report.losses.extend(left_out_below(packed.content))
     if packed.root is None:

@@ -23,7 +23,7 @@ from imutool.log_info.clock import IncreasingStamps, SensorStamps, sorted_stamps
 from imutool.log_info.report import Interval
 from imutool.mcap_io.log import Log
 from imutool.recording import nanoseconds
-from imutool.recording.columns import clock_jumps
+from imutool.recording.columns import clock_jumps, median
 from imutool.recording.sample_order import TICK_SPAN, ticked
 
 APART_NS = nanoseconds(60.0)  # of stretches that are read by themselves
@@ -41,6 +41,7 @@ class ImuSamples:
         sound: stamps of the samples.
         frames: messages by the frame that they name.
         stamps, jumps: faults of the stamps, and jumps of their clock.
+        unsorted: whether the messages are one recording in another order than that of their log times.
     """
 
     def __init__(self, log: Log, topic: str) -> None:
@@ -55,7 +56,7 @@ class ImuSamples:
         self._lag_ns = np.inf, -np.inf  # of the log times behind the stamps
         self.frames = FrameCounts()
         recorded, self.sound = SensorStamps(), IncreasingStamps()
-        self.stamps, messages, finite = NO_FAULTS, 0, 0
+        self.stamps, self.unsorted, messages, finite = NO_FAULTS, False, 0, 0
         for samples in blocks(counted_frames(raw_batches(log, topic), self.frames)):
             good = measured(samples.values)
             recorded.see(samples.stamp_ns)
@@ -83,11 +84,12 @@ class ImuSamples:
 
     def _hold_stamps(self) -> None:
         """Reads all stamps into memory, and settles the order of the samples."""
-        parts = [(samples.stamp_ns.copy(), measured(samples.values)) for samples in self._read()]
-        t_ns = np.concatenate([np.zeros(0, np.int64), *(stamps for stamps, _ in parts)])
-        rows = np.flatnonzero(np.concatenate([np.zeros(0, bool), *(good for _, good in parts)]))
+        parts = [(samples.stamp_ns.copy(), samples.log_ns.copy(), measured(samples.values)) for samples in self._read()]
+        t_ns, log_ns = (np.concatenate([np.zeros(0, np.int64), *(part[column] for part in parts)]) for column in (0, 1))
+        rows = np.flatnonzero(np.concatenate([np.zeros(0, bool), *(good for *_, good in parts)]))
         self.stamps, self.jumps, self.recorded = read_stamps(t_ns), clock_jumps(t_ns), sorted_stamps(t_ns)
         self.counts["out_of_order"] = int((t_ns < np.maximum.accumulate(t_ns)).sum()) if len(t_ns) else 0
+        self.unsorted = self.counts["out_of_order"] > 0 and _ordered_by(log_ns, t_ns)
         self.counts["duplicated"] = len(t_ns) - len(distinct(t_ns))
         line = distinct(restamped(t_ns) if self.stamps.batch > 1.0 or self.stamps.fraction else t_ns)
         self.counts["missing"] = int(missing(line, usual_period(line), ticked(line)).sum()) if len(line) > 1 else 0
@@ -156,3 +158,18 @@ class ImuSamples:
                 of[(of < a) | (samples.stamp_ns > last_ns[of])] = -1
                 for stretch in np.flatnonzero(np.bincount(of[of >= 0])).tolist():  # unlike `unique`, without masked arrays
                     yield stretch, samples.values[of == stretch]
+
+
+def _ordered_by(log_ns: Int64[np.ndarray, " n"], t_ns: Int64[np.ndarray, " n"]) -> bool:
+    """Whether stamps in order of log time are those of one recording.
+
+    A clock that was set back sets the log times back, too. In their order its samples would come between earlier ones, closer
+    than the sensor measures, or with a jump before them.
+    """
+    steps, forward = np.diff(t_ns[np.argsort(log_ns, kind="stable")]), np.diff(t_ns)
+    forward = forward[forward > 0]
+    if not len(forward):
+        return False
+    short = median(forward) / 2.0
+    closer = int((steps < short).sum()) > int((forward < short).sum())
+    return int(steps.min()) >= 0 and not closer and not clock_jumps(np.sort(t_ns))

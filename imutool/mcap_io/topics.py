@@ -41,7 +41,7 @@ CUT, MAX_REPEATED = "Cut the log before or after it", 0.2  # share of stamps tha
 UNIT_KEY = "unit"  # channel metadata of a scalar
 MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM, schemas.POSE_COVARIANCE)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
-CLEAN_FIX = "See what is wrong with imutool clean LOG; imutool debias --clean LOG OUT leaves it out on TOPIC/debiased"
+CLEAN_FIX = "imutool info LOG and clean LOG show what is wrong; imutool debias --clean LOG OUT leaves it out on TOPIC/debiased"
 RESTAMP = "imutool convert LOG OUT --restamp"
 UNSET_FIX = f"A stamp of 0 is not set: {RESTAMP} takes the log times"
 

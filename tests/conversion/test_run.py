@@ -208,6 +208,13 @@ def test_where_nothing_is_recognised_the_message_says_what_was_looked_for(tmp_pa
     assert not (tmp_path / "out").exists()
 
 
+def test_a_log_that_is_not_of_the_format_is_told_which_one_was_expected(tmp_path):
+    imutool_api.write(tmp_path / "log.mcap", imutool_api.example_recording())
+    expected = r"no sequence found; expected a recording of the format euroc. Leave `format` out: then the recording"
+    with pytest.raises(DataError, match=expected):
+        convert(tmp_path / "log.mcap", tmp_path / "out", format="euroc")
+
+
 def test_an_existing_log_is_kept_unless_overwriting_is_asked_for(source, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "b.mcap").write_bytes(b"precious")

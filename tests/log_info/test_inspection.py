@@ -167,6 +167,33 @@ def test_disorder_repeats_and_values_that_are_no_numbers_are_counted_not_refused
     assert {"1 sample out of order", "1 sample with a repeated stamp"} <= set(found["warnings"])
 
 
+@pytest.mark.parametrize(
+    ("set_back", "clock", "sorts"),
+    [(0, "stamp", True), (0, "file", False), (50, "stamp", False), (50.4, "stamp", False), (10**7, "stamp", False)],
+    ids=["halves in the wrong order", "late stamps", "clock set back", "the same between samples", "by half a day"],
+)
+def test_messages_that_convert_puts_in_order_are_named(tmp_path, set_back, clock, sorts):
+    """Two halves in the wrong order follow each other by their log times; of a clock that was set back they overlap."""
+    numbers = [*range(100, 200), *range(100)] if not set_back else [*range(100), *(n - set_back for n in range(100, 200))]
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        imu = writer.register_channel("/imu", "json", writer.register_schema("Imu", "jsonschema", b'{"type": "object"}'))
+        for row, n in enumerate(numbers):
+            t_ns = START_NS + round(n * PERIOD_NS)
+            vectors = {name: {"x": 0.0, "y": 1e-3 * n, "z": 9.81} for name in ("angularVelocity", "linearAcceleration")}
+            data = json.dumps({"header": {"stamp": {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}}, **vectors}).encode()
+            writer.add_message(imu, t_ns if clock == "stamp" else START_NS + row * PERIOD_NS, data, t_ns)
+        writer.finish()
+    (found,) = described(tmp_path / "a.mcap")["imu"]
+    assert found["out_of_order"] > 0
+    named = "the messages are not in order of their log time; imutool convert LOG OUT puts them in order"
+    assert (named in found["warnings"]) is sorts
+    if sorts:
+        convert(tmp_path / "a.mcap", tmp_path / "b.mcap")
+        np.testing.assert_allclose(read(tmp_path / "b.mcap").imu.gyro[:, 1], 1e-3 * np.arange(200))
+
+
 def test_clipping_is_seen_and_noise_and_coarse_steps_are_not(tmp_path):
     imu = swinging()
     clipped = replace(imu, gyro=imu.gyro.clip(-1.0, 1.0))

@@ -213,8 +213,8 @@ def others(
 
 def _offered(log: Log, topic: str, message: bytes) -> list[str]:
     """Numeric fields of a topic, none where it has no readable definition."""
-    try:
-        return _numeric(log, topic, message, long=False)
+    try:  # not by `log.named`: from Python 3.12 on its error holds itself and the message until the next collection
+        return decoder_of(log, log.topics[topic]).paths(message, long=False)
     except LogError:
         return []
 
