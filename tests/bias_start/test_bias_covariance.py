@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from imutool.bias import hybrid, static
+from imutool.bias_start import bias_covariance
 from imutool.bias_start.bias_covariance import BiasEstimator, ExpectedDrift
 from imutool.bias_start.bias_tracking import BiasTrajectory
 from imutool.bias_start.initial_bias import InitialBias
@@ -120,3 +121,18 @@ def test_a_body_at_rest_is_expected_to_drift_as_a_constant_bias_makes_it(lost: s
     for variances in found:
         np.testing.assert_allclose(variances[:3], (STD[:3] * length_s) ** 2, rtol=0.02)
         np.testing.assert_allclose(variances[3:], (STD[3:] * length_s) ** 2 + tilted, rtol=0.03)
+
+
+def test_what_a_window_expects_does_not_depend_on_how_the_samples_before_it_came(
+    turning: Samples, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one window, or passed in parts: the mean of a calibration's errors counts each sample once."""
+    monkeypatch.setattr(bias_covariance, "PASSED_AT_ONCE", 30)
+    t_s, gyro, accel = turning
+    imu = Imu((1e9 * t_s).astype(np.int64), gyro, accel)
+    path = Poses(imu.t_ns, np.zeros((SIZE, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (SIZE, 1)), np.zeros((SIZE, 3)))
+    passed, seen = (
+        ExpectedDrift(model_of("gyro_scale"), WAYS["followed"], imu)(path, np.array(windows))[-1]
+        for windows in ([[100, 150]], [[0, 100], [100, 150]])
+    )
+    np.testing.assert_allclose(passed, seen, rtol=1e-9)
