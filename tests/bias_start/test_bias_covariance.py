@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imutool.bias import hybrid, static
+from imutool.bias import hybrid, linear, static
 from imutool.bias_start import bias_covariance
 from imutool.bias_start.bias_covariance import BiasEstimator, ExpectedDrift
 from imutool.bias_start.bias_tracking import BiasTrajectory
@@ -85,6 +85,18 @@ def test_blocks_change_nothing(turning: Samples, way: str) -> None:
     whole, _ = calibrated(model, way, turning)
     parts, _ = calibrated(model, way, turning, blocks=37)
     np.testing.assert_allclose(parts, whole, rtol=1e-9, atol=SAME * (G_STD * 9.81) ** 2)
+
+
+@pytest.mark.parametrize("gap_s", [100.0, 1e6])
+def test_a_held_bias_walks_through_a_gap_as_far_as_switchings_on_differ(gap_s: float) -> None:
+    """By q T, and no further than to the prior's variance; a start that is less sure than the prior stays so."""
+    walk_std, prior_std = np.repeat([1e-5, 1e-4], 3), np.repeat([1e-3, 1e-2], 3)
+    model = linear.Model(linear.Config(), RATE_HZ, {"walk_std": walk_std, "prior_std": prior_std})
+    t_s = np.array([0.0, 0.005, gap_s, gap_s + 0.005])
+    rest = BiasEstimator(model, WAYS["held"]).parts(t_s, np.zeros((4, 3)), np.tile([0.0, 0.0, 9.81], (4, 1))).rest
+    grown = np.clip(STD**2 + walk_std**2 * gap_s, None, np.maximum(STD, prior_std) ** 2)
+    for row, expected in zip(rest, (STD**2, STD**2, grown, grown), strict=True):
+        np.testing.assert_allclose(row, np.diag(expected), rtol=0.02)
 
 
 @pytest.mark.parametrize("way", WAYS)
