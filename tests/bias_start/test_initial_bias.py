@@ -535,7 +535,9 @@ def test_a_prior_that_the_log_contradicts_gives_way_and_one_that_it_bears_out_st
     np.testing.assert_array_equal(widened(std, near, variance), std)
     wide = widened(std, far, variance)
     np.testing.assert_allclose(wide[:3], 9e-3 / np.sqrt(3))
-    np.testing.assert_array_equal(wide[3:], std[3:]), "nothing was shown of the accelerometer"
+    np.testing.assert_array_equal(wide[3:], std[3:], "nothing was shown of the accelerometer")
+    of_one_axis = np.array([np.inf, np.inf, 1e-8] + [np.inf] * 3)
+    np.testing.assert_allclose(widened(std, far, of_one_axis)[:3], 9e-3)
 
 
 def test_two_axes_that_repeat_speak_for_the_third_and_a_large_change_is_believed() -> None:
