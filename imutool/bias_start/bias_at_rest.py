@@ -58,7 +58,7 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
     """
     first_ns = int(imu.t_ns[0]) if len(imu) else 0
     imu = imu.rows(slice(0, int(np.searchsorted(imu.t_ns, first_ns + nanoseconds(LOOK_AHEAD_S)))))
-    before = bias_prior(model, first_ns if len(imu) else None)
+    before = bias_prior(model, first_ns)
     blocks = _up_to_first_stop(model, imu, before)
     if not model.card and not (blocks and blocks[0].resting):
         raise _no_rest()

@@ -72,7 +72,7 @@ class BiasEstimator:
         """Bias with the calibration's covariance as roots, for means over many samples."""
         bias, P = self._rest.estimate(t_s, gyro, accel)
         roots: Roots = {} if self._calibration is None or not len(t_s) else self._calibration(t_s, gyro, accel)
-        return EstimateParts(bias, P, roots if self._mean is None or not roots else self._mean.subtract(roots))
+        return EstimateParts(bias, P, roots if self._mean is None else self._mean.subtract(roots))
 
 
 class _RunningMean:

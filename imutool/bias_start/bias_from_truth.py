@@ -229,12 +229,12 @@ def bias_from_truth(
             turned = quaternion.unit(quaternion.running_product(np.where(alone[:-1, None], own, steps)))
         R = quaternion.matrix(running)
         error = quaternion.rotate(running, quaternion.log(quaternion.multiply(quaternion.inverse(running), turned)))
-        offset[:3] -= _slope(error, np.cumsum(R * dt[..., None], axis=0), trusted[1:], R - np.eye(3), mount_std)
+        offset[:3] -= _slope(error, np.cumsum(R * dt[..., None], axis=0), trusted[1:], mount_std * (R - np.eye(3)))
     R_wb = quaternion.matrix(_attitudes(t_s, rate - offset[:3], q_wb_wxyz, trusted))
     a_w = (R_wb @ force[..., None])[..., 0] + np.array(GRAVITY_W)
     dv = np.cumsum(_step_means(a_w) * dt, axis=0)
     by_force = np.cumsum(_step_means(R_wb) * dt[..., None], axis=0)
-    offset[3:] = -_slope(v_w[1:] - v_w[0] - dv, by_force, trusted[1:])
+    offset[3:] = -_slope(v_w[1:] - v_w[0] - dv, by_force, trusted[1:], by_force[..., :0])
     return offset
 
 
@@ -260,18 +260,11 @@ def _attitudes(
 
 
 def _slope(
-    error: Rows,
-    by: Float64[np.ndarray, "n 3 3"],
-    valid: Bool[np.ndarray, " n"],
-    by_nuisance: Float64[np.ndarray, "n 3 3"] | None = None,
-    nuisance_std: float = 0.0,
+    error: Rows, by: Float64[np.ndarray, "n 3 3"], valid: Bool[np.ndarray, " n"], by_nuisance: Float64[np.ndarray, "n 3 k"]
 ) -> Float64[np.ndarray, "3"]:
-    """b of error = e_0 + by b + by_nuisance z, by least squares with Huber's weights; z has a prior about zero."""
+    """b of error = e_0 + by b + by_nuisance z, by least squares with Huber's weights; z ~ N(0, 1)."""
     y = error[valid]
-    parts = [by[valid], np.broadcast_to(np.eye(3), (len(y), 3, 3))]
-    if by_nuisance is not None and nuisance_std > 0.0:
-        parts.append(by_nuisance[valid])
-    X = np.concatenate(parts, axis=2)
+    X = np.concatenate([by[valid], np.broadcast_to(np.eye(3), (len(y), 3, 3)), by_nuisance[valid]], axis=2)
     k, weight, ridge = X.shape[2], np.ones(len(y)), np.zeros((X.shape[2],) * 2)
     for _ in range(ITERATIONS):
         weighted = (X * weight[:, None, None]).reshape(-1, k).T
@@ -280,7 +273,6 @@ def _slope(
         middle = (len(size) - 1) // 2
         limit = max(HUBER_MEDIANS * float(np.partition(size, middle)[middle]), 1e-9)
         weight = limit / np.maximum(size, limit)
-        if nuisance_std > 0.0:
-            ridge[range(6, k), range(6, k)] = SAME * (limit / nuisance_std) ** 2
+        ridge[range(6, k), range(6, k)] = SAME * limit**2
     slope: Float64[np.ndarray, "3"] = solution[:3]
     return slope

@@ -17,7 +17,7 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_tracking import BLOCK_S, BiasFilter, FilteredBlock, Samples, filter_together
+from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_together
 from imutool.bias_start.fitness import head
 from imutool.bias_start.initial_bias import bias_prior
 from imutool.errors import ConfigError
@@ -41,7 +41,7 @@ def with_earlier_load(model: BiasModel, batches: Iterable[Samples], first_ns: in
     if not model.follows_load() or model.load_before is not None:
         return model
     samples = head(batches)
-    if len(samples[0]) < 2 or samples[0][-1] < BLOCK_S:
+    if not len(samples[0]):
         return model
     loads = loads_after(model.rate_hz, samples)
     log_likelihood = _log_likelihood([after_load(model, load) for load in loads], samples, first_ns)

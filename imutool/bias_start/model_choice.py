@@ -154,8 +154,6 @@ def bound_to(model: BiasModel, recording: Recording, where: str | Location = "",
     t_ns = recording.imu.t_ns
     model = at_rate(model, 1.0 / recording.imu.period_s, where or recording.name, t_ns, force=force)
     model = bound(model, recording.scalars, recording.imu_topic, int(t_ns[0]), int(t_ns[-1]))
-    if not model.follows_load():
-        return model
     return with_earlier_load(model, [model_samples(model, recording.imu)], int(t_ns[0]))
 
 

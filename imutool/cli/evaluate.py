@@ -222,11 +222,11 @@ def vio(
                 results += run(log, models=model or (), **read, progress=tell)
         if not results:
             raise_kept(errors)
-    if common.write(VioReport(results)):
-        return
-    for rows in tabulate(results):
-        table(rows, keys=3)
-    say(f"Camera, simulated along the truth: {results[0]['camera']}; {results[0]['tracks']} tracks in a frame")
-    for row in results:
-        if row["failed"]:
-            say(f"{row['log']}, {row['model']}, bias states {'on' if row['bias_states'] else 'off'}: {row['failed']}")
+    if not common.write(VioReport(results)):
+        for rows in tabulate(results):
+            table(rows, keys=3)
+        say(f"Camera, simulated along the truth: {results[0]['camera']}; {results[0]['tracks']} tracks in a frame")
+        for row in results:
+            if row["failed"]:
+                say(f"{row['log']}, {row['model']}, bias states {'on' if row['bias_states'] else 'off'}: {row['failed']}")
+    raise_kept(errors)

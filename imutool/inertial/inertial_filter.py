@@ -229,8 +229,7 @@ def _predict(
     variances, walked = np.einsum("...ii->...i", P), walk**2 * T
     variances += MIN_VARIANCE
     variances[..., BIAS] += walked[:6]
-    if len(walked) > 6:
-        variances[..., SIZE:] += walked[6:]
+    variances[..., SIZE:] += walked[6:]
     expected = State(R, v, p, x.bias, x.ground, x.steady, P, x.offsets)
     return Step(x, expected, F, expected)
 

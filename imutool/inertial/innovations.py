@@ -85,8 +85,6 @@ def share_of_correction(without: Innovations, corrected: Innovations) -> Share:
     correction does more good than harm. The deviation allows for dependent innovations (Newey and West, "A simple, positive
     semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix", Econometrica 1987).
     """
-    if not len(without.e):
-        return Share(0.0, math.inf)
     S = 0.5 * (without.S + corrected.S)
     d = without.e - corrected.e
     weight = 1.0 / np.maximum(1.0, np.minimum(without.chi_square, corrected.chi_square) / SURPRISING)

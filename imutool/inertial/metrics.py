@@ -269,7 +269,6 @@ def pairs_by_distance(
     above = np.searchsorted(travelled, travelled[i] + distance_m, side="left")
     above = np.clip(above, i + 1, len(travelled) - 1)
     below = np.searchsorted(travelled, travelled[above - 1], side="left")  # first of the points that share that distance
-    below = np.clip(below, i + 1, above)
     miss_above = np.abs(travelled[above] - travelled[i] - distance_m)
     miss_below = np.abs(travelled[below] - travelled[i] - distance_m)
     near = np.minimum(miss_below, miss_above) <= distance_m * PAIR_TOLERANCE

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imutool.bias import hybrid, static
+from imutool.bias import hybrid, linear, static
+from imutool.bias_start import bias_covariance
 from imutool.bias_start.bias_covariance import BiasEstimator, ExpectedDrift
 from imutool.bias_start.bias_tracking import BiasTrajectory
 from imutool.bias_start.initial_bias import InitialBias
@@ -86,6 +87,18 @@ def test_blocks_change_nothing(turning: Samples, way: str) -> None:
     np.testing.assert_allclose(parts, whole, rtol=1e-9, atol=SAME * (G_STD * 9.81) ** 2)
 
 
+@pytest.mark.parametrize("gap_s", [100.0, 1e6])
+def test_a_held_bias_walks_through_a_gap_as_far_as_switchings_on_differ(gap_s: float) -> None:
+    """By q T, and no further than to the prior's variance; a start that is less sure than the prior stays so."""
+    walk_std, prior_std = np.repeat([1e-5, 1e-4], 3), np.repeat([1e-3, 1e-2], 3)
+    model = linear.Model(linear.Config(), RATE_HZ, {"walk_std": walk_std, "prior_std": prior_std})
+    t_s = np.array([0.0, 0.005, gap_s, gap_s + 0.005])
+    rest = BiasEstimator(model, WAYS["held"]).parts(t_s, np.zeros((4, 3)), np.tile([0.0, 0.0, 9.81], (4, 1))).rest
+    grown = np.clip(STD**2 + walk_std**2 * gap_s, None, np.maximum(STD, prior_std) ** 2)
+    for row, expected in zip(rest, (STD**2, STD**2, grown, grown), strict=True):
+        np.testing.assert_allclose(row, np.diag(expected), rtol=0.02)
+
+
 @pytest.mark.parametrize("way", WAYS)
 def test_the_bias_of_an_estimate_is_that_of_the_stream(turning: Samples, way: str) -> None:
     model = model_of("gyro_scale")
@@ -120,3 +133,18 @@ def test_a_body_at_rest_is_expected_to_drift_as_a_constant_bias_makes_it(lost: s
     for variances in found:
         np.testing.assert_allclose(variances[:3], (STD[:3] * length_s) ** 2, rtol=0.02)
         np.testing.assert_allclose(variances[3:], (STD[3:] * length_s) ** 2 + tilted, rtol=0.03)
+
+
+def test_what_a_window_expects_does_not_depend_on_how_the_samples_before_it_came(
+    turning: Samples, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one window, or passed in parts: the mean of a calibration's errors counts each sample once."""
+    monkeypatch.setattr(bias_covariance, "PASSED_AT_ONCE", 30)
+    t_s, gyro, accel = turning
+    imu = Imu((1e9 * t_s).astype(np.int64), gyro, accel)
+    path = Poses(imu.t_ns, np.zeros((SIZE, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (SIZE, 1)), np.zeros((SIZE, 3)))
+    passed, seen = (
+        ExpectedDrift(model_of("gyro_scale"), WAYS["followed"], imu)(path, np.array(windows))[-1]
+        for windows in ([[100, 150]], [[0, 100], [100, 150]])
+    )
+    np.testing.assert_allclose(passed, seen, rtol=1e-9)

@@ -96,7 +96,8 @@ def test_a_live_node_says_since_when_the_sensor_is_on(tmp_path: Path) -> None:
     bias = model.stream(np.zeros(6))(*model_samples(model, after(600.0, 50, 60.0).imu))
     assert np.abs(bias).max() < 1e-6 + np.abs(model.tensors["theta_gyro"]).max() * (1 + 1e-6)
     assert np.ptp(bias, axis=0).max() < 1e-9  # it has long been warm
-    assert bound_to(model, after(0.0, 50, 20.0)) is model  # what is given is not asked again
+    cold = imutool.load_model(tmp_path / "warming.safetensors", on_s=0.0)
+    assert bound_to(cold, after(600.0, 50, 60.0)) is cold  # what is given is not asked again
     for wrong in (-1.0, math.nan, math.inf):
         with pytest.raises(ConfigError, match="on_s"):
             imutool.load_model(tmp_path / "warming.safetensors", on_s=wrong)
@@ -119,7 +120,9 @@ def test_a_model_without_drift_and_a_log_without_samples_are_left_alone() -> Non
     plain = hybrid.Model(hybrid.Config(gyro_effects=("gyro_scale",), accel_effects=(), remainder=False), RATE_HZ)
     assert with_earlier_load(plain, [model_samples(plain, after(60.0, 50, 5.0).imu)]) is plain
     assert switched_on_before(plain, 60.0) is plain
-    assert with_earlier_load(warming(), []).load_before is None
+    few = model_samples(plain, after(60.0, 50, 1.0).imu)
+    for count in (0, 1, 2, 20):
+        assert with_earlier_load(warming(), [tuple(column[:count] for column in few)]).load_before is None
 
 
 def test_a_steady_turn_is_no_stop() -> None:

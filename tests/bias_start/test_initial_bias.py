@@ -14,7 +14,7 @@ from imutool.bias import linear, static
 from imutool.bias.model import BiasModel
 from imutool.bias_start import bias_at_rest
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest, rest_differences
-from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
+from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth, poses_turn_alone
 from imutool.bias_start.bias_tracking import Samples
 from imutool.bias_start.initial_bias import (
     AT_REST_STD,
@@ -292,6 +292,19 @@ def test_poses_that_are_wrong_and_then_hidden_for_a_second_are_no_bias(biased: R
     np.testing.assert_allclose(start.rest[:3], right.rest[:3], atol=1e-3)
 
 
+def test_a_fast_turn_while_poses_are_hidden_is_shown_by_a_gyro_of_another_scale() -> None:
+    """5 % of 150° are more than poses jump by, and no more than such a gyro errs by."""
+    t = np.arange(0.0, 5.0, 0.005)
+    turning, t_ns = (t > 2.0) & (t < 3.5), np.round(1e9 * t).astype(np.int64)
+    rate = np.radians(100.0) * turning
+    turn = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * 0.005)])
+    q_wb = Rotation.from_rotvec(turn[:, None] * [0.0, 0.0, 1.0]).as_quat(scalar_first=True)
+    poses = Poses(t_ns, np.zeros((len(t), 3)), q_wb).rows(~turning)
+    for scale, alone in ((1.05, False), (0.5, True)):
+        imu = Imu(t_ns, scale * rate[:, None] * [0.0, 0.0, 1.0], np.tile([0.0, 0.0, GRAVITY_M_S2], (len(t), 1)))
+        assert poses_turn_alone(imu, poses).any() == alone
+
+
 def test_poses_whose_parts_disagree_are_trusted_less(biased: Recording) -> None:
     """The world of the poses leans to and fro by six degrees, slowly."""
     t = seconds(biased.truth.t_ns, int(biased.imu.t_ns[0]))
@@ -522,7 +535,9 @@ def test_a_prior_that_the_log_contradicts_gives_way_and_one_that_it_bears_out_st
     np.testing.assert_array_equal(widened(std, near, variance), std)
     wide = widened(std, far, variance)
     np.testing.assert_allclose(wide[:3], 9e-3 / np.sqrt(3))
-    np.testing.assert_array_equal(wide[3:], std[3:]), "nothing was shown of the accelerometer"
+    np.testing.assert_array_equal(wide[3:], std[3:], "nothing was shown of the accelerometer")
+    of_one_axis = np.array([np.inf, np.inf, 1e-8] + [np.inf] * 3)
+    np.testing.assert_allclose(widened(std, far, of_one_axis)[:3], 9e-3)
 
 
 def test_two_axes_that_repeat_speak_for_the_third_and_a_large_change_is_believed() -> None:

@@ -77,9 +77,14 @@ def test_several_findings_are_one_sentence_strongest_first_with_their_gain_and_w
 
 def test_of_many_findings_the_three_strongest_are_named() -> None:
     weaker = [finding(name, {"k": Estimate(1.0, 0.1, "K")}, "gyro") for name in ("gyro_scale", "gyro_quadratic")]
-    said = headline(replace(diagnoses.BOTH, findings=(diagnoses.LEVER_ARM, diagnoses.LAG, diagnoses.DRIVEN, *weaker)))
+    five = (diagnoses.LEVER_ARM, diagnoses.LAG, diagnoses.DRIVEN, *weaker)
+    said = headline(replace(diagnoses.BOTH, findings=five))
     assert said.startswith("Five effects separate the recording from the true poses: lever_arm (accel), clock_offset (gyro), ")
     assert "driven by /motor.current (accel) and 2 smaller ones; together they remove" in said
+    unknown = {signal: replace(closer, share=None) for signal, closer in diagnoses.BOTH.closer.items()}
+    said = headline(replace(diagnoses.BOTH, findings=(*five, *weaker), closer=unknown))
+    assert said.startswith("7 effects separate ")
+    assert "remove" not in said
 
 
 def test_poses_made_with_the_gyro_are_a_caveat_of_the_headline() -> None:

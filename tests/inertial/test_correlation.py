@@ -35,6 +35,14 @@ def test_samples_that_count_as_one_are_those_of_the_theory() -> None:
     assert dependent_samples(a - a.mean(), b - b.mean()) == pytest.approx((1.0 + 0.45) / (1.0 - 0.45), rel=0.1)
 
 
+def test_lines_count_as_few_samples_whatever_their_frequencies() -> None:
+    """Of two vibrations the sum of the theory swings about zero with the length, and a negative number is none of samples."""
+    t = np.arange(LENGTH) / LENGTH
+    for apart in np.arange(0.0, 6.0, 0.25):  # periods in the whole length
+        a, b = np.sin(2 * np.pi * 75.0 * t), np.sin(2 * np.pi * (75.0 + apart) * t + 1.0)
+        assert dependent_samples(a - a.mean(), b - b.mean()) > 0.05 * LENGTH
+
+
 @pytest.mark.parametrize("start", [0, 700, 2200])
 def test_a_short_signal_is_found_in_a_long_one(start: int) -> None:
     rng = np.random.default_rng(3)

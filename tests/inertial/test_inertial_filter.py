@@ -89,22 +89,26 @@ def test_heading_is_never_found_out() -> None:
     assert steps(x)[-1].after.P[2, 2] > 1.0
 
 
-def test_a_move_is_linear_in_the_error() -> None:
+@pytest.mark.parametrize("resting", [False, True])
+def test_a_move_is_linear_in_the_error(resting: bool) -> None:
     """F against the integral itself: a small error before, and what it is after. Jr is first order in the turn of a step."""
     t = np.arange(101) / 200.0
     rng = np.random.default_rng(3)
     gyro, accel = 0.8 * rng.normal(size=3) + np.zeros((101, 3)), np.array([0.3, 0.1, 9.9]) + 0.2 * rng.normal(size=(101, 3))
+    mean = np.concatenate([np.zeros(3), accel.mean(axis=0)])
     x = start(0.7).moved(np.concatenate([np.zeros(3), [0.8, -0.5, 0.3], [1.0, 2.0, -3.0], np.zeros(SIZE - 9)]), start().P)
 
-    def expected(y: State) -> State:
-        return motion_step(y, integrate(t, gyro - y.bias[:3], accel - y.bias[3:]), gyro[-1] - y.bias[:3], 0.0, WALK, S).expected
+    def step(y: State) -> Step:
+        if resting:
+            return rest_step(y, mean, np.full(3, 1e-8), 0.5, WALK, S)
+        return motion_step(y, integrate(t, gyro - y.bias[:3], accel - y.bias[3:]), gyro[-1] - y.bias[:3], 0.0, WALK, S)
 
-    F = motion_step(x, integrate(t, gyro - x.bias[:3], accel - x.bias[3:]), gyro[-1] - x.bias[:3], 0.0, WALK, S).F
+    F = step(x).F
     size = 1e-6
-    for i in range(15):
+    for i in range(SIZE):
         e = np.zeros(SIZE)
         e[i] = size
-        slope = (expected(x.moved(e, x.P)).minus(expected(x.moved(-e, x.P)))) / (2 * size)
+        slope = (step(x.moved(e, x.P)).expected.minus(step(x.moved(-e, x.P)).expected)) / (2 * size)
         np.testing.assert_allclose(slope, F[:, i], rtol=0, atol=1e-4, err_msg=str(i))
 
 

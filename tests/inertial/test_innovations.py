@@ -71,6 +71,17 @@ def test_a_jolt_does_not_decide() -> None:
     assert share_of_correction(Innovations(e, S), Innovations(e - d, S)).value == pytest.approx(quiet.value, abs=0.2)
 
 
+def test_what_a_correction_does_not_take_away_its_opposite_brings_back() -> None:
+    """From corrected samples on, the share a is 1 - a: jolts count less if both have them, and no side's errors do alone."""
+    rng = np.random.default_rng(8)
+    S, d = covariances(rng), rng.standard_cauchy(size=(BLOCKS, 3))
+    e = 0.3 * d + rng.standard_t(2.0, size=(BLOCKS, 3))
+    without, corrected = Innovations(e, S), Innovations(e - d, S)
+    there, back = share_of_correction(without, corrected), share_of_correction(corrected, without)
+    assert back == pytest.approx((1.0 - there.value, there.std))
+    assert there.value == pytest.approx(0.3, abs=4.0 * there.std)
+
+
 def test_nothing_to_compare_tells_nothing() -> None:
     S = np.tile(np.eye(3), (4, 1, 1))
     same, none = Innovations(np.ones((4, 3)), S), Innovations(np.zeros((0, 3)), np.zeros((0, 3, 3)))

@@ -156,10 +156,11 @@ def test_the_noise_of_the_poses_is_in_the_acceleration() -> None:
     assert np.sqrt(np.mean(error[50:-50] ** 2)) > 10.0  # 1 mm over (10 ms)²: the reason smoothing exists
 
 
-def test_an_instant_outside_the_trajectory_is_refused() -> None:
+@pytest.mark.parametrize("t_s", [-0.1, 4.1])
+def test_an_instant_outside_the_trajectory_is_refused(t_s: float) -> None:
     trajectory = follow(still, lambda t: Rotation.identity(len(t)))
     with pytest.raises(NumericsError, match="outside the trajectory"):
-        trajectory.at(ns(np.array([4.1])))
+        trajectory.at(ns(np.array([t_s])))
 
 
 def test_a_quaternion_spline_through_zero_is_refused() -> None:

@@ -134,6 +134,8 @@ def test_a_constant_offset_is_its_own_error_and_vanishes_when_aligned() -> None:
     assert figures["ape_m"] == pytest.approx(5.0, abs=EXACT)
     assert figures["velocity_rmse_m_s"] == pytest.approx(0.5, abs=EXACT)
     assert figures["ape_aligned_m"] == pytest.approx(0.0, abs=EXACT)
+    bare = Poses(truth.t_ns, truth.p_wb, truth.q_wb_wxyz)
+    assert absolute(at_rest, bare, everything(truth)) == figures | {"velocity_rmse_m_s": None}, "positions are enough"
     rigid = absolute(moved(truth, turn, shift), truth, everything(truth))
     assert rigid["aoe_aligned_deg"] == pytest.approx(0.0, abs=1e-6)
     assert rigid["ape_aligned_m"] == pytest.approx(0.0, abs=EXACT)

@@ -21,6 +21,7 @@ from imutool.inertial.strapdown import (
     dead_reckon,
     drift,
     truth_velocity,
+    velocity_follows,
     window_drift,
 )
 from imutool.recording import Imu, Poses, unit_quaternions
@@ -258,3 +259,12 @@ def test_v1_01_gives_the_published_error_against_its_recomputed_truth_once_their
     assert valid.all()
     figures = absolute(dead_reckon(imu, StartPose(true.q_wb_wxyz[0], true.p_wb[0], np.zeros(3))), true, valid)
     assert figures["aoe_deg"] == pytest.approx(113.47, abs=PUBLISHED_TOLERANCE_DEG)
+
+
+@pytest.mark.parametrize(("count", "follows"), [(0, True), (1, True), (100, True), (400, False)])
+def test_velocities_of_other_axes_are_refuted_by_positions_over_more_than_a_second(count: int, follows: bool) -> None:
+    t_ns = RATE_NS * np.arange(count)
+    p_wb = np.outer(1e-9 * t_ns, [2.0, 0.0, 0.0])
+    poses = Poses(t_ns, p_wb, np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)), np.tile([0.0, 2.0, 0.0], (count, 1)))
+    assert velocity_follows(poses) == follows
+    assert velocity_follows(Poses(t_ns, p_wb, poses.q_wb_wxyz))

@@ -80,6 +80,7 @@ def test_the_next_log_of_a_session_lies_within_its_prior_however_few_its_logs() 
             deviations.append((rest[-1] - session.mean) / session.std)
         outside = (np.abs(deviations) > 1.96).reshape(-1, 2, 3).mean(axis=(0, 2))
         assert (outside < 0.08).all(), f"{count} logs: {outside} of 0.05; with the variance of the logs alone 0.09 and more"
+        assert outside[1] > 0.03, f"{count} logs: wider than a sensor that is as noisy asks for"
 
 
 def test_a_shift_at_rest_has_to_be_shown_by_the_logs_together() -> None:

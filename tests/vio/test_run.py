@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.cli import evaluate as scores
 from imutool.config import plain
-from imutool.errors import DataError
+from imutool.errors import DataError, LogError
 from imutool.inertial import metrics
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
@@ -157,10 +157,16 @@ def test_a_run_that_fails_does_not_stop_the_others(perfect: Recording, tmp_path:
     json.dumps([raw, static], allow_nan=False)
 
 
-def test_the_command_writes_json_and_a_table(code: Callable[..., int], capsys: pytest.CaptureFixture[str], logs: Path) -> None:
+def test_the_command_writes_json_and_a_table(
+    code: Callable[..., int], capsys: pytest.CaptureFixture[str], logs: Path, tmp_path: Path
+) -> None:
+    """A log that cannot be read is named in the end, and costs the others nothing but the exit code."""
+    (tmp_path / "bad.mcap").write_text("no log")
     words = ("vio", logs / "flight_1.mcap", "--no-bias-states", "--duration", "4", "--blackout", "1", "-q")
-    assert code(*words, "--json", "-") == 0
-    report = json.loads(capsys.readouterr().out)
+    assert code(*words, tmp_path / "bad.mcap", "--json", "-") == LogError.exit_code
+    written = capsys.readouterr()
+    report = json.loads(written.out)
+    assert "bad.mcap: this is not an MCAP log" in written.err
     assert report["schema"] == SCHEMA == "imutool.vio/1"
     (raw,) = report["results"]
     assert raw["bias_states"] is False
