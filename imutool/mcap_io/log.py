@@ -16,24 +16,13 @@ from imutool.errors import DataError, LogError
 from imutool.file_location import Location, location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records, schemas
-from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch
+from imutool.mcap_io.codec.decode import CLEAN_FIX, ImuBatch, PoseBatch, StampCheck, check_finite
 from imutool.mcap_io.codec.joined_imu import choice_of, no_imu_fix, parse_parts, whole_of
 from imutool.mcap_io.codec.records import HEAD, keep_buffers
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.passthrough.chunk_check import KeptChunks, neighbours, unpack_together
 from imutool.mcap_io.storage.source import Source
-from imutool.mcap_io.topics import (
-    CLEAN_FIX,
-    ENCODINGS,
-    MESSAGE_POSES,
-    PART_KEY,
-    StampCheck,
-    Topic,
-    check_finite,
-    joined_topic,
-    reflected_topics,
-    topics_of,
-)
+from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES, PART_KEY, Topic, joined_topic, reflected_topics, topics_of
 from imutool.recording.message_log import COMMAND
 
 logger = logging.getLogger(__name__)

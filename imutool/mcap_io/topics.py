@@ -1,4 +1,4 @@
-"""Topics of a log, batches of their messages, and checks of numbers and stamps."""
+"""Topics of a log, and batches of their messages."""
 
 from __future__ import annotations
 
@@ -9,18 +9,21 @@ from types import MappingProxyType
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64, Int64, Shaped, UInt8, UInt32
+from imutool.array_types import Bool, Float64, Int64, Shaped, UInt8
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, ros2_definition, schemas
 from imutool.mcap_io.codec.decode import (
+    CUT,
     ImuBatch,
     PoseBatch,
     ScalarBatch,
     TwistColumns,
+    check_finite,
     decode_imu,
     decode_poses,
     decode_scalars,
     decode_twist,
+    named,
 )
 from imutool.mcap_io.codec.joined_imu import JoinedImu, Vectors, whole_of
 from imutool.mcap_io.codec.messages import Messages, Rows
@@ -37,13 +40,9 @@ PART_KEY = "imutool_part_of"  # channel metadata: one sensor of the IMU on that 
 RECORDED_KEY = "imutool_recorded_as"  # channel metadata: the original of the IMU on that topic
 KIND_KEY = "imutool_kind"  # channel metadata of poses: truth, estimate, odometry or unknown
 VELOCITY_KEY = "imutool_velocity_of"  # channel metadata: the world velocity of the poses on this topic
-CUT, MAX_REPEATED = "Cut the log before or after it", 0.2  # share of stamps that repeat; more come in batches
 UNIT_KEY = "unit"  # channel metadata of a scalar
 MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM, schemas.POSE_COVARIANCE)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
-CLEAN_FIX = "See what is wrong with imutool clean LOG; imutool debias --clean LOG OUT leaves it out on TOPIC/debiased"
-RESTAMP = "imutool convert LOG OUT --restamp"
-UNSET_FIX = f"A stamp of 0 is not set: {RESTAMP} takes the log times"
 
 
 @dataclass(frozen=True)
@@ -154,49 +153,8 @@ def _runs(rows: Rows, schema_name: str, encoding: str) -> Iterator[tuple[Rows, s
             done = part.stop
             yield rows.where(part), layout
     except LogError as error:
-        what = f"{_named(rows, done)} is no {schema_name}: {error.what}"
+        what = f"{named(rows, done)} is no {schema_name}: {error.what}"
         raise LogError(what, expected=error.expected, fix=error.fix or ("" if error.expected else CUT)) from error
-
-
-def _named(batch: Rows | ImuBatch, row: int) -> str:
-    """A message by sequence and log time: many recorders leave the sequence at 0."""
-    return f"message {batch.sequence[row]} (log time {batch.log_time[row] * 1e-9:.3f} s)"
-
-
-def check_finite(batch: Rows | ImuBatch, fix: str = CUT, **fields: Float64[np.ndarray, "n _"]) -> None:
-    """Refuses NaN and infinity, naming the message (LogError)."""
-    for name, values in fields.items():
-        if not (good := np.isfinite(values).all(axis=1)).all():
-            row = int(np.argmin(good))
-            raise LogError(f"{_named(batch, row)} has {name} {values[row].tolist()}", expected="finite numbers", fix=fix)
-
-
-@dataclass(slots=True)
-class StampCheck:
-    """Refuses stamps that repeat or go back, across batches."""
-
-    count: int = 0
-    last: int | None = None
-    fix: str = ""  # what to do about it
-
-    def check(self, stamp_ns: Int64[np.ndarray, " n"], sequence: UInt32[np.ndarray, " n"]) -> None:
-        """Takes in the next stamps.
-
-        Raises:
-            LogError: one does not come after the one before it; the message names the message and both stamps.
-        """
-        if not len(stamp_ns):
-            return
-        before = np.concatenate([[stamp_ns[0] - 1 if self.last is None else self.last], stamp_ns[:-1]])
-        bad = stamp_ns <= before
-        if bad.any():
-            row = int(np.argmax(bad))
-            how, same = "repeats" if stamp_ns[row] == before[row] else "goes back", (stamp_ns == before).mean()
-            fix = f"{RESTAMP} spreads samples that share a stamp" if self.fix and same > MAX_REPEATED else self.fix
-            what = f"message {self.count + row} (sequence {sequence[row]}) has the stamp {stamp_ns[row]} ns, which {how}: "
-            what = f"{what}the message before has {before[row]} ns"
-            raise LogError(what, expected="stamps that increase", fix=fix if stamp_ns[row] else UNSET_FIX)
-        self.count, self.last = self.count + len(stamp_ns), int(stamp_ns[-1])
 
 
 def topics_of(index: LogIndex) -> dict[str, Topic]:
