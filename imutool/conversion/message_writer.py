@@ -16,14 +16,14 @@ import numpy as np
 import imutool
 from imutool.array_types import Shaped, UInt8
 from imutool.conversion.restamping import SharedStamps
-from imutool.conversion.robot_messages import Paths, Px4, pose_kind, px4_of
+from imutool.conversion.robot_messages import Paths, Px4, pose_kind, px4_of, reflected_of, reflection_note
 from imutool.conversion.sensor_pairs import SensorPairs
 from imutool.conversion.user_labels import check_kinds
-from imutool.errors import DataError, not_installed
+from imutool.errors import DataError
 from imutool.file_location import Location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
-from imutool.mcap_io.codec.reflection import LOG_TIME, WITHOUT_STAMP, Reflected, reflect
+from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.codec.transforms import Transforms
 from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
@@ -122,16 +122,13 @@ class _Stream:
 
     def _define(self, topic: MessageTopic, first: bytes | memoryview | None = None) -> int:
         """Define a topic; an IMU or a pose in protobuf or the like becomes CDR under its name, its original gets another."""
-        if first is not None and (found := _reflected(topic, bytes(first))) is not None:
+        if first is not None and (found := reflected_of(topic, bytes(first), self._source)) is not None:
             marks = ((KIND_KEY, named_kind(topic.name, topic.schema_name)),) if found.schema_name != schemas.IMU else ()
             cdr = self._define(MessageTopic(topic.name, found.schema_name, "ros2msg", b"", "cdr", marks))
             recorded = (*topic.metadata, (RECORDED_KEY, topic.name))
             number = self.channels[topic] = self._define(replace(topic, name=f"{topic.name}/as_recorded", metadata=recorded))
             self._reflected[number] = cdr, found
-            si = "rad/s and m/s^2" if found.schema_name == schemas.IMU else "metres"
-            units = f"{found.units}, as the schema states" if found.units else si
-            note = f"{topic.name}: {topic.message_encoding} became {found.schema_name}, taken as {units}"
-            self._source.remarks.notes.append(note if found.stamp else f"{note}; at the {LOG_TIME}, {WITHOUT_STAMP}")
+            self._source.remarks.notes.append(reflection_note(topic, found))
             return number
         kind = self._source.kinds.get(topic.name)
         marked = topic if kind is None else replace(topic, metadata=(*topic.metadata, (KIND_KEY, kind)))
@@ -206,20 +203,6 @@ class _Stream:
             self._lacking[topic.name] += 1
             return
         self._put(channel, log_time, publish_time, reflected.encode([sample]).tobytes())  # type: ignore[list-item]  # its own
-
-
-def _reflected(topic: MessageTopic, first: bytes) -> Reflected | Transforms | None:
-    """Fields of an IMU or poses in a topic of another encoding; None for the original of a translated topic.
-
-    Raises:
-        ConfigError: its messages are protobuf, which is not installed.
-    """
-    if RECORDED_KEY in dict(topic.metadata):
-        return None
-    try:
-        return reflect(topic.message_encoding, topic.name, topic.schema_name, topic.schema, first)
-    except ImportError as error:
-        raise not_installed("protobuf", "protobuf", where=topic.name, user="reading such messages") from error
 
 
 def _write_metadata(log: LogWriter, source: MessageLog) -> None:

@@ -63,7 +63,7 @@ class Log:
     def _read_topics(self) -> None:
         """Reads the topics from the index; IMUs of other types may need the first messages."""
         self.topics = MappingProxyType(topics_of(self.index))
-        self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, self.firsts)})
+        self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, self.firsts, self.rows)})
 
     def __enter__(self) -> Log:
         return self

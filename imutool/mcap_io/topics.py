@@ -182,11 +182,15 @@ def topics_of(index: LogIndex) -> dict[str, Topic]:
 
 
 def reflected_topics(
-    index: LogIndex, topics: Mapping[str, Topic], firsts: Callable[[Collection[str]], Iterator[tuple[str, bytes]]]
+    index: LogIndex,
+    topics: Mapping[str, Topic],
+    firsts: Callable[[Collection[str]], Iterator[tuple[str, bytes]]],
+    rows: Callable[[Collection[str]], Iterator[tuple[str, Rows]]],
 ) -> dict[str, Topic]:
     """IMUs and poses among the topics whose type is not that of ROS.
 
-    `firsts` gives the first messages of some. Types of ROS 2 count only if no other IMU was recorded: drivers publish both.
+    `firsts` gives the first messages of some, `rows` all of them.
+    Types of ROS 2 count only if no other IMU was recorded: drivers publish both.
     """
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
     found = {n: _as_ros(t, p) for n, t in topics.items() if (p := named_poses(definitions[n], t.message_encoding)) is not None}
@@ -216,7 +220,15 @@ def reflected_topics(
         elif imu is not None or name in odd:  # whose bytes would be read in the order of another
             which = "two definitions" if len(texts[name]) > 1 else "another definition"
             found[name] = replace(topic, schema_name=f"{topic.schema_name} ({which})")
-    return found
+    return {name: _with_clock(topic, rows([name])) for name, topic in found.items()}
+
+
+def _with_clock(topic: Topic, parts: Iterator[tuple[str, Rows]]) -> Topic:
+    """Topic whose stamps have the unit that its first messages show."""
+    if not isinstance(topic.reflected, Reflected):
+        return topic
+    messages = ((int(t), raw.tobytes()) for _, rows in parts for t, raw in zip(rows.log_time, rows.payload, strict=True))
+    return replace(topic, reflected=topic.reflected.settled(messages))
 
 
 def _have_one_layout(topic: Topic, texts: Collection[bytes]) -> bool:

@@ -1,4 +1,4 @@
-"""Decode messages into columns, in one numpy pass for many messages; checks of their numbers and stamps.
+"""Decode messages into columns of numbers and stamps, and check these.
 
 Quaternions are xyzw in messages and wxyz in memory; here they change.
 """
