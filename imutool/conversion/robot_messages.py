@@ -24,7 +24,7 @@ from imutool.mcap_io.codec.reflection import BY_LOG_TIMES, LOG_TIME, WITHOUT_STA
 from imutool.mcap_io.codec.ros2_definition import DescribedCdr, parse
 from imutool.mcap_io.codec.transforms import Transforms
 from imutool.mcap_io.topics import RECORDED_KEY
-from imutool.recording.message_log import MessageLog, MessageTopic, named_kind
+from imutool.recording.message_log import MessageLog, MessageTopic, computed_kind
 
 PACKAGE = "px4_msgs/msg/"
 WHOLE_IMUS, SINGLE_SENSORS = ("SensorCombined", "VehicleImu"), ("SensorGyro", "SensorAccel")
@@ -59,6 +59,8 @@ def reflection_note(topic: MessageTopic, found: Reflected | Transforms) -> str:
     si = "rad/s and m/s^2" if found.schema_name == schemas.IMU else "metres"
     units = f"{found.units}, as the schema states" if found.units else si
     note = f"{topic.name}: {topic.message_encoding} became {found.schema_name}, taken as {units}"
+    if isinstance(found, Reflected) and found.pose is not None:
+        note = f"{note}; its poses are on {topic.name}/pose"
     if isinstance(found, Reflected) and found.stamp_unit:
         return f"{note}; {found.stamp_path} is in {found.stamp_unit}, {BY_LOG_TIMES}"
     return note if found.stamp else f"{note}; at the {LOG_TIME}, {WITHOUT_STAMP}"
@@ -156,8 +158,7 @@ def _px4(topic: MessageTopic, kind: str, schema_name: str, ending: str) -> Px4 |
 
 def pose_kind(topic: str) -> str:
     """Kind of the poses of PX4 or of a path: by the topic's name, else an estimate."""
-    kind = named_kind(re.sub(r"/fmu/out/vehicle_odometry(_v\d+)?$", "", topic), "")  # which is the EKF's
-    return "estimate" if kind == "unknown" else kind
+    return computed_kind(re.sub(r"/fmu/out/vehicle_odometry(_v\d+)?$", "", topic), "")  # which is the EKF's
 
 
 class Trajectory(NamedTuple):

@@ -94,7 +94,7 @@ def describe(log: RecoveredLog, *, check: bool) -> LogInfo:
         path=str(log.path),
         bytes=log.path.stat().st_size,
         profile=log.index.header.profile,
-        messages=sum(topic.count for topic in topics),
+        messages=sum(topic.count for topic in log.topics.values() if not topic.recorded_on),
         first_ns=first,
         last_ns=last,
         duration_s=None if first is None or last is None else (last - first) * 1e-9,

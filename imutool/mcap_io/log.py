@@ -243,7 +243,7 @@ class Log:
 
     def channel_ids(self, topic: str) -> set[int]:
         """Channels of a topic; for a joined IMU those of its gyroscope."""
-        name = (found.gyro_topic if (found := self.topics.get(topic)) else "") or topic
+        name = (found.recorded_on if (found := self.topics.get(topic)) else "") or topic
         if self._ids[0] != (known := (id(self.index), len(self.index.channels))):  # asked for each of many topics
             self._ids = known, {}
             for i, channel in self.index.channels.items():

@@ -28,10 +28,10 @@ from imutool.mcap_io.codec.decode import (
 from imutool.mcap_io.codec.joined_imu import JoinedImu, Vectors, whole_of
 from imutool.mcap_io.codec.messages import Messages, Rows
 from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
-from imutool.mcap_io.codec.transforms import Transforms, named_poses
+from imutool.mcap_io.codec.transforms import Transforms, listed_poses
 from imutool.mcap_io.index import LogIndex
 from imutool.recording.joined_imu import joined
-from imutool.recording.message_log import named_kind
+from imutool.recording.message_log import computed_kind, named_kind
 
 ENCODINGS, DESCRIBED = ("cdr", "ros1"), {("ros2msg", "cdr"), ("ros1msg", "ros1")}
 REFLECTED = ("protobuf", "json", "flatbuffer")  # encodings whose messages are searched for those of an IMU and for poses
@@ -60,7 +60,7 @@ class Topic:
     metadata: Mapping[str, str]
     reflected: Reflected | JoinedImu | Transforms | None = None
     own_schema: str = ""  # name in the log of the type of a reflected IMU or pose
-    gyro_topic: str = ""  # of an IMU joined of two topics, whose messages stand for its own
+    recorded_on: str = ""  # topic whose messages stand for its own: the gyro of a joined IMU, the IMU beside a pose
 
     @property
     def is_derived(self) -> bool:
@@ -193,7 +193,8 @@ def reflected_topics(
     Types of ROS 2 count only if no other IMU was recorded: drivers publish both.
     """
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
-    found = {n: _as_ros(t, p) for n, t in topics.items() if (p := named_poses(definitions[n], t.message_encoding)) is not None}
+    lists = {name: listed_poses(definitions[name], topic.message_encoding, topic.pose_kind) for name, topic in topics.items()}
+    found = {name: _as_ros(topics[name], poses) for name, poses in lists.items() if poses is not None}
     reflected = {n: t for n, t in topics.items() if t.message_encoding in REFLECTED and RECORDED_KEY not in t.metadata}
     in_json = [name for name, topic in reflected.items() if topic.message_encoding == "json"]
     texts_of = {name: definition.data if (definition := definitions[name]) else b"" for name in reflected}
@@ -220,7 +221,9 @@ def reflected_topics(
         elif imu is not None or name in odd:  # whose bytes would be read in the order of another
             which = "two definitions" if len(texts[name]) > 1 else "another definition"
             found[name] = replace(topic, schema_name=f"{topic.schema_name} ({which})")
-    return {name: _with_clock(topic, rows([name])) for name, topic in found.items()}
+    settled = [_with_clock(topic, rows([name])) for name, topic in found.items()]
+    beside = [pose for topic in settled for pose in _poses_beside(topic)]
+    return {topic.name: topic for topic in [*settled, *(pose for pose in beside if pose.name not in topics)]}
 
 
 def _with_clock(topic: Topic, parts: Iterator[tuple[str, Rows]]) -> Topic:
@@ -229,6 +232,13 @@ def _with_clock(topic: Topic, parts: Iterator[tuple[str, Rows]]) -> Topic:
         return topic
     messages = ((int(t), raw.tobytes()) for _, rows in parts for t, raw in zip(rows.log_time, rows.payload, strict=True))
     return replace(topic, reflected=topic.reflected.settled(messages))
+
+
+def _poses_beside(imu: Topic) -> Iterator[Topic]:
+    """Poses in the messages of an IMU: an estimate, unless the topic's name says more."""
+    if isinstance(imu.reflected, Reflected) and (pose := imu.reflected.pose) is not None:
+        name, marks = f"{imu.name}/pose", {KIND_KEY: computed_kind(imu.name, imu.own_schema)}
+        yield replace(imu, name=name, schema_name=schemas.POSE, metadata=marks, reflected=pose, recorded_on=imu.name)
 
 
 def _have_one_layout(topic: Topic, texts: Collection[bytes]) -> bool:
@@ -256,7 +266,7 @@ def joined_topic(gyro: Topic, accel: Topic, rows: Callable[[str], Iterator[Rows]
     imu, _, notes = joined(gyro_ns, rates, accel_ns, forces, name, spread=False)  # the messages keep their stamps
     message = JoinedImu(gyro.cut, partial(gyro.vectors, sensor="gyro"), imu.t_ns, imu.accel)
     encoding = gyro.message_encoding if gyro.message_encoding in ENCODINGS else "cdr"
-    return Topic(name, schemas.IMU, "ros2msg", encoding, len(imu), {}, message, gyro_topic=gyro.name), notes
+    return Topic(name, schemas.IMU, "ros2msg", encoding, len(imu), {}, message, recorded_on=gyro.name), notes
 
 
 def _column(parts: Iterable[Iterator[Vectors]]) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:

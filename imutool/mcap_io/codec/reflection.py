@@ -80,8 +80,9 @@ class Reflected:
     other_stamps: tuple[Path, ...] = ()  # further times in the message, which do not count
     sizes: tuple[float, float] = (1.0, 1.0)  # of the rates and the accelerations of an IMU in SI, as the definition states
     units: str = ""  # that the definition states, in words
-    counts: tuple[Path, ...] = ()  # times without a unit, in a message that states no stamp
-    stamp_unit: str = ""  # that the log times show
+    counts: tuple[Path, ...] = ()  # times without a unit, in a message that states no stamp; the unit that log times show
+    stamp_unit: str = ""
+    pose: Reflected | None = None  # in the messages of an IMU
 
     @property
     def stamp_path(self) -> str:
@@ -91,16 +92,17 @@ class Reflected:
     def settled(self, messages: Iterable[tuple[int, bytes]]) -> Reflected:
         """Fields with the stamp whose unit the log times of the first messages show, where the message states none."""
         first = list(islice(messages, FEW if self.counts and not self.stamp else 0))
-        for path in self.counts if first else ():
+        for path in self.counts[: len(first)]:
             with suppress(*LACKS):
                 values = [self.format.at(self.format.parse(raw), path) for _, raw in first]
                 if unit := unit_ns(values, [log_time for log_time, _ in first]):
-                    size = float(unit) if any(isinstance(value, float) for value in values) else unit
-                    return replace(self, stamp=((path, size),), stamp_unit=UNITS_NS[unit])
+                    stamp = ((path, float(unit) if any(isinstance(value, float) for value in values) else unit),)
+                    pose = self.pose and replace(self.pose, stamp=stamp, stamp_unit=UNITS_NS[unit])
+                    return replace(self, stamp=stamp, stamp_unit=UNITS_NS[unit], pose=pose)
         return self
 
     def sample(self, raw: bytes, log_time: int) -> Sample:
-        """Sample in a message; at its log time where it has no stamp.
+        """Sample in a message; at its log time where it has no stamp: 0 is one of a clock that runs.
 
         Raises:
             ValueError: the bytes are no such message, or it lacks a field.
@@ -112,7 +114,7 @@ class Reflected:
             values = [float(at(message, path)) for path in self.vectors]
             if self.sizes != (1.0, 1.0):
                 values = [self.sizes[n // 3] * value for n, value in enumerate(values)]
-            return Sample(stamp_ns or log_time, frame, values)
+            return Sample(stamp_ns or (0 if self.stamp_unit else log_time), frame, values)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"the message lacks {error}") from error
 
@@ -211,7 +213,7 @@ def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: b
     if form is None or not isinstance(tree, Mapping):
         return None
     if (imu := _found(tree, form)) is not None:
-        return _in_si(imu, form)
+        return _whole(imu, tree, form)
     return _pose(tree, form) if re.search(POSE_TYPES, f"{topic} {schema_name}".lower()) else None
 
 
@@ -247,17 +249,17 @@ def reflect_cdr(schema_name: str, schema: bytes, encoding: str = "cdr") -> Refle
         form = ros2_definition.DescribedCdr(ros2_definition.parse(schema_name, schema), encoding)
     except LogError:
         return None
-    found = _found(form.tree(DEPTH), form)
-    return None if found is None else _in_si(found, form)
+    found = _found(tree := form.tree(DEPTH), form)
+    return None if found is None else _whole(found, tree, form)
 
 
-def _in_si(found: Reflected, form: Format) -> Reflected:
-    """Fields of an IMU with the sizes of the units that their names or the definition state."""
+def _whole(found: Reflected, tree: Tree, form: Format) -> Reflected:
+    """Fields of an IMU with the sizes of the units that their names or the definition state, and of a pose beside."""
     comments = getattr(form, "comments", lambda _: ())
     paths = dict(zip(STATED, (found.vectors[0], found.vectors[3]), strict=True))
     stated = {sensor: unit_in_name(sensor, path) or unit_in(comments(path), STATED[sensor]) for sensor, path in paths.items()}
     names = ", ".join(f"{sensor} in {unit}" for sensor, (unit, _) in stated.items() if unit)
-    return replace(found, sizes=(stated["gyro"][1], stated["accel"][1]), units=names)
+    return replace(found, sizes=(stated["gyro"][1], stated["accel"][1]), units=names, pose=_pose(tree, form))
 
 
 def _found(tree: Tree, form: Format) -> Reflected | None:
@@ -278,8 +280,7 @@ def _found(tree: Tree, form: Format) -> Reflected | None:
         for pattern in (GYRO, ACCEL)
     ]
     stamp, *others = [*stamps_of(fields)] or [()]
-    unused = tuple(other[0][0] for other in others)
-    counts = () if stamp else counts_in(fields)
+    unused, counts = tuple(other[0][0] for other in others), () if stamp else counts_in(fields)
     return Reflected(IMU, form, (*gyro, *accel), stamp, frame, tuple(covariances), unused, counts=counts)
 
 

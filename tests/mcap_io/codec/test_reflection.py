@@ -13,6 +13,7 @@ from google.protobuf import descriptor_pb2, timestamp_pb2
 from mcap.writer import Writer
 
 from imutool.conversion.run import convert
+from imutool.log_info.inspection import inspect
 from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -127,13 +128,15 @@ COUNTS = {  # a time without a unit, and how it counts the nanoseconds since som
 }
 
 
-def driver_log(path: Path, fields: Callable[[int], dict[str, object]], count: int = 100, spread_ns: int = 4_000_000) -> Path:
+def driver_log(
+    path: Path, fields: Callable[[int], dict[str, object]], spread_ns: int = 4_000_000, topic: str = "/imu", count: int = 100
+) -> Path:
     """JSON of an IMU whose messages come up to `spread_ns` late."""
     late = np.random.default_rng(1).integers(spread_ns, size=count).tolist()
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        channel = writer.register_channel("/imu", "json", writer.register_schema("Imu", "jsonschema", b"{}"))
+        channel = writer.register_channel(topic, "json", writer.register_schema("Imu", "jsonschema", b"{}"))
         for n in range(count):
             log_ns = START_NS + n * 10**9 // RATE_HZ + late[n]
             message = {**fields(n * 10**9 // RATE_HZ), "gyro": [0.1, 0.2, 0.01 * n], "accel": [0.0, 0.0, 9.81]}
@@ -184,3 +187,25 @@ def test_a_number_that_counts_no_time_is_no_stamp(tmp_path: Path, fields: Callab
     (note,) = convert(path, tmp_path / "b.mcap").notes
     assert note.endswith("; at the log time, as the messages state no stamp with its unit")
     assert np.array_equal(read(path).imu.t_ns, START_NS + 10**7 * np.arange(100))
+
+
+@pytest.mark.parametrize(("topic", "kind"), [("/ego", "estimate"), ("/ego/truth", "truth"), ("/odom", "odometry")])
+def test_a_pose_in_the_messages_of_an_imu_has_a_topic_of_its_own(tmp_path: Path, topic: str, kind: str) -> None:
+    """Its poses were left out without a word."""
+
+    def state(ns: int) -> dict[str, object]:
+        turn = {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
+        return {"time": ns * 1e-9, "position": {"x": ns * 1e-9, "y": 2.0, "z": 3.0}, "orientation": turn}
+
+    path = driver_log(tmp_path / "a.mcap", state, topic=topic)
+    convert(path, tmp_path / "b.mcap")
+    for log_path in (path, tmp_path / "b.mcap"):
+        with Log(log_path) as log:
+            assert log.imu_topics == [topic]
+            assert log.pose_topics == [f"{topic}/pose"]
+            assert log.topics[f"{topic}/pose"].pose_kind == kind
+        recording = read(log_path, truth=f"{topic}/pose")
+        assert np.array_equal(recording.truth.t_ns, recording.imu.t_ns)
+        np.testing.assert_allclose(recording.truth.p_wb[:, 0], 0.01 * np.arange(100), atol=1e-9)
+        np.testing.assert_allclose(recording.truth.q_wb_wxyz[0], [0.8, 0.0, 0.0, 0.6])
+    assert inspect(path).messages == 100
