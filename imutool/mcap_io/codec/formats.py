@@ -13,9 +13,9 @@ import numpy as np
 from imutool.mcap_io.codec.schemas import NS_PER_S
 
 STAMP = r"timestamp|stamp|time|sensor_?time"
-CLOCK = r"((hw|hardware|device|sensor|sample|imu|host|header|capture|ts)_?)?(time|timestamp|stamp|t|ts)"
+CLOCK = r"((hw|hardware|device|sensor|sample|imu|host|header|capture|ts)_?)?(time|time_?stamp|stamp|t|ts)"
 COUNTED = {rf"{CLOCK}_?ns(ec)?": 1, rf"{CLOCK}_?us(ec)?|utime": 1000}  # stamps of one number
-COUNT = rf"{CLOCK}(_?(s(ec(ond)?s?)?|m(illi)?s(ec(ond)?s?)?))?"  # without a unit, or in one that is coarse
+COUNT = rf"ticks?|{CLOCK}(_?(s(ec(ond)?s?)?|m(illi)?s(ec(ond)?s?)?))?"  # without a unit, or in one that is coarse
 UNITS_NS = {1: "ns", 1000: "us", 10**6: "ms", NS_PER_S: "s"}
 FEW, MIN_PASSED_NS = 2000, NS_PER_S // 4  # messages that show the unit at most, and the time that they take at least
 CLOCK_ERROR, LATENCY_NS = 0.02, NS_PER_S // 10  # by which a clock and its recorder differ; units do by a factor of a thousand

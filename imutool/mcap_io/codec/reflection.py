@@ -213,7 +213,7 @@ def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: b
     if form is None or not isinstance(tree, Mapping):
         return None
     if (imu := _found(tree, form)) is not None:
-        return _whole(imu, tree, form)
+        return replace(_in_si(imu, form), pose=_pose(tree, form))
     return _pose(tree, form) if re.search(POSE_TYPES, f"{topic} {schema_name}".lower()) else None
 
 
@@ -249,17 +249,17 @@ def reflect_cdr(schema_name: str, schema: bytes, encoding: str = "cdr") -> Refle
         form = ros2_definition.DescribedCdr(ros2_definition.parse(schema_name, schema), encoding)
     except LogError:
         return None
-    found = _found(tree := form.tree(DEPTH), form)
-    return None if found is None else _whole(found, tree, form)
+    found = _found(form.tree(DEPTH), form)
+    return None if found is None else _in_si(found, form)  # without a pose: drivers put latitude and longitude there
 
 
-def _whole(found: Reflected, tree: Tree, form: Format) -> Reflected:
-    """Fields of an IMU with the sizes of the units that their names or the definition state, and of a pose beside."""
+def _in_si(found: Reflected, form: Format) -> Reflected:
+    """Fields of an IMU with the sizes of the units that their names or the definition state."""
     comments = getattr(form, "comments", lambda _: ())
     paths = dict(zip(STATED, (found.vectors[0], found.vectors[3]), strict=True))
     stated = {sensor: unit_in_name(sensor, path) or unit_in(comments(path), STATED[sensor]) for sensor, path in paths.items()}
     names = ", ".join(f"{sensor} in {unit}" for sensor, (unit, _) in stated.items() if unit)
-    return replace(found, sizes=(stated["gyro"][1], stated["accel"][1]), units=names, pose=_pose(tree, form))
+    return replace(found, sizes=(stated["gyro"][1], stated["accel"][1]), units=names)
 
 
 def _found(tree: Tree, form: Format) -> Reflected | None:

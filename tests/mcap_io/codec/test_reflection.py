@@ -145,6 +145,23 @@ def driver_log(
     return path
 
 
+def test_a_robot_counts_ticks_of_a_millisecond() -> None:
+    """As Unitree's LowState does, which has no header."""
+    found = reflected("float32[3] gyroscope\nfloat32[3] accelerometer\nuint32 tick\n")
+    raw = [b"\0\1\0\0" + struct.pack("<6fI", *VALUES, 777 + 2 * n) for n in range(500)]
+    settled = found.settled((START_NS + 2_000_000 * n + 1000 * (n % 7), message) for n, message in enumerate(raw))
+    assert (settled.stamp_unit, settled.sample(raw[3], START_NS).stamp_ns) == ("ms", 783_000_000)
+    assert struct.unpack("<6fI", settled.with_stamp(raw[3], 999_000_000)[4:])[-1] == 999
+
+
+def test_a_position_in_a_driver_s_own_message_is_no_pose() -> None:
+    """VectorNav's CommonGroup has latitude and longitude there."""
+    vector = "float64 x\nfloat64 y\nfloat64 z\n"
+    types = {"V": vector, "Q": f"{vector}float64 w\n"}
+    parts = "".join(f"{'=' * 80}\nMSG: my_driver/{name}\n{text}" for name, text in types.items())
+    assert reflected(f"V angularrate\nV accel\nV position\nQ quaternion\n{parts}").pose is None
+
+
 @pytest.mark.parametrize("unit", COUNTS)
 def test_the_log_times_show_the_unit_of_a_stamp(tmp_path: Path, unit: str) -> None:
     """Such logs had the jitter of the log times."""
