@@ -50,6 +50,7 @@ ROS_NAMES = {"f4": "float32", "f8": "float64", "b1": "bool"} | {
 }
 LATEST_NS = 2**63 - 1  # of 64 bits with a sign, as numpy counts
 MAX_JUMPS = 1000  # of the clock, that are counted
+_Sampled = Reflected | Transforms | Px4  # what reads a sample from a message
 ENCAPSULATION = 4  # bytes ahead of a CDR message; alignment counts from behind them
 _encode_body = partial(encode_imu, frame_id=BODY)
 
@@ -110,7 +111,7 @@ class _Stream:
         self._buffers: dict[int, MessageBuffer] = {}  # by channel
         self._shared = MessageBuffer(packed=False), MessageBuffer(packed=False)  # of sensors, and of all others that are small
         self._sequence = Counter[int]()
-        self._reflected: dict[int, list[tuple[int, Reflected | Transforms | Px4]]] = {}  # channels of CDR, by the original's
+        self._reflected: dict[int, list[tuple[int, _Sampled]]] = {}  # channels of CDR, by the original's
         self._has_imu = any(schemas.canonical(topic.schema_name) == schemas.IMU for topic in source.topics)
         self._begun = set[int]()  # channels that have messages
         self._made_of = set[str]()  # topics of PX4 from which another is made
@@ -123,10 +124,9 @@ class _Stream:
     def _define(self, topic: MessageTopic, first: bytes | memoryview | None = None) -> int:
         """Define a topic; an IMU or a pose in protobuf or the like becomes CDR under its name, its original gets another."""
         if first is not None and (found := reflected_of(topic, bytes(first), self._source)) is not None:
-            each = {topic.name: found}
+            cdr: list[tuple[int, _Sampled]] = [(self._define(_translated(topic, topic.name, found)), found)]
             if isinstance(found, Reflected) and found.pose is not None:
-                each[f"{topic.name}/pose"] = found.pose
-            cdr = [(self._define(_translated(topic, name, part)), part) for name, part in each.items()]
+                cdr.append((self._define(_translated(topic, f"{topic.name}/pose", found.pose)), found.pose))
             recorded = (*topic.metadata, (RECORDED_KEY, topic.name))
             number = self.channels[topic] = self._define(replace(topic, name=f"{topic.name}/as_recorded", metadata=recorded))
             self._reflected[number] = cdr
