@@ -21,11 +21,10 @@ from imutool.cleaning.rules.stuck import repeated
 from imutool.cleaning.samples import FrameCounts
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.file_location import Location
-from imutool.mcap_io.codec.decode import ImuBatch
+from imutool.mcap_io.codec.decode import CLEAN_FIX, UNSET_FIX, ImuBatch
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read_recordings
 from imutool.mcap_io.temperature import with_temperatures
-from imutool.mcap_io.topics import CLEAN_FIX, UNSET_FIX
 from imutool.recording import GRAVITY_M_S2, Imu, Recording, nanoseconds, seconds
 from imutool.recording.columns import MAX_GAP_S, jump_warnings, quantile
 

@@ -20,9 +20,8 @@ from imutool.cleaning.samples import FrameCounts, Motion, Samples, blocks, count
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
-from imutool.mcap_io.codec.decode import ImuBatch
+from imutool.mcap_io.codec.decode import RESTAMP, ImuBatch
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import RESTAMP
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
 from imutool.units import SENSORS
 

@@ -159,7 +159,7 @@ def topic_rows(report: LogInfo) -> list[tuple[str, ...]]:
 
 def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
     """Rows of the property table of IMUs and truth, the header first."""
-    from imutool.mcap_io.codec.reflection import WITHOUT_STAMP
+    from imutool.mcap_io.codec.reflection import BY_LOG_TIMES, WITHOUT_STAMP
 
     rows: list[tuple[str, ...]] = [("topic", "property", "value")]
     for imu in map(json_values, report.imu):
@@ -169,7 +169,8 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
         rows.append((imu["topic"], "samples", str(imu["samples"])))
         rows += [(imu["topic"], name.replace("_", " "), str(imu[name])) for name in counts]
         if "time" in imu:
-            why = f"not {', '.join(imu['other_times'])}" if imu["other_times"] else WITHOUT_STAMP
+            why = f"in {imu['time_unit']}, {BY_LOG_TIMES}" if "time_unit" in imu else WITHOUT_STAMP
+            why = f"not {', '.join(imu['other_times'])}" if imu["other_times"] else why
             rows.append((imu["topic"], "time of the samples", f"{imu['time']}, {why}"))
         stated = [imu["stated_units"]] if "stated_units" in imu else []
         rows += [(imu["topic"], "units", f"{units}, by the comments of its definition") for units in stated]

@@ -16,14 +16,14 @@ import numpy as np
 import imutool
 from imutool.array_types import Shaped, UInt8
 from imutool.conversion.restamping import SharedStamps
-from imutool.conversion.robot_messages import Paths, Px4, pose_kind, px4_of
+from imutool.conversion.robot_messages import Paths, Px4, pose_kind, px4_of, reflected_of, reflection_note
 from imutool.conversion.sensor_pairs import SensorPairs
 from imutool.conversion.user_labels import check_kinds
-from imutool.errors import DataError, not_installed
+from imutool.errors import DataError
 from imutool.file_location import Location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
-from imutool.mcap_io.codec.reflection import LOG_TIME, WITHOUT_STAMP, Reflected, reflect
+from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.codec.transforms import Transforms
 from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
@@ -40,7 +40,7 @@ from imutool.mcap_io.write import (
 )
 from imutool.recording import nanoseconds
 from imutool.recording.columns import MAX_GAP_S, clock_jumps, jump_warnings
-from imutool.recording.message_log import MessageLog, MessageTopic, Table, named_kind
+from imutool.recording.message_log import MessageLog, MessageTopic, Table, computed_kind, named_kind
 
 BULKY = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
 SENSORS = (schemas.IMU, schemas.VECTOR3, schemas.TF, schemas.FLOAT, *MESSAGE_POSES)
@@ -50,6 +50,7 @@ ROS_NAMES = {"f4": "float32", "f8": "float64", "b1": "bool"} | {
 }
 LATEST_NS = 2**63 - 1  # of 64 bits with a sign, as numpy counts
 MAX_JUMPS = 1000  # of the clock, that are counted
+_Sampled = Reflected | Transforms | Px4  # what reads a sample from a message
 ENCAPSULATION = 4  # bytes ahead of a CDR message; alignment counts from behind them
 _encode_body = partial(encode_imu, frame_id=BODY)
 
@@ -110,7 +111,7 @@ class _Stream:
         self._buffers: dict[int, MessageBuffer] = {}  # by channel
         self._shared = MessageBuffer(packed=False), MessageBuffer(packed=False)  # of sensors, and of all others that are small
         self._sequence = Counter[int]()
-        self._reflected: dict[int, tuple[int, Reflected | Transforms | Px4]] = {}  # channel of the CDR, by that of the original
+        self._reflected: dict[int, list[tuple[int, _Sampled]]] = {}  # channels of CDR, by the original's
         self._has_imu = any(schemas.canonical(topic.schema_name) == schemas.IMU for topic in source.topics)
         self._begun = set[int]()  # channels that have messages
         self._made_of = set[str]()  # topics of PX4 from which another is made
@@ -122,16 +123,14 @@ class _Stream:
 
     def _define(self, topic: MessageTopic, first: bytes | memoryview | None = None) -> int:
         """Define a topic; an IMU or a pose in protobuf or the like becomes CDR under its name, its original gets another."""
-        if first is not None and (found := _reflected(topic, bytes(first))) is not None:
-            marks = ((KIND_KEY, named_kind(topic.name, topic.schema_name)),) if found.schema_name != schemas.IMU else ()
-            cdr = self._define(MessageTopic(topic.name, found.schema_name, "ros2msg", b"", "cdr", marks))
+        if first is not None and (found := reflected_of(topic, bytes(first), self._source)) is not None:
+            cdr: list[tuple[int, _Sampled]] = [(self._define(_translated(topic, topic.name, found)), found)]
+            if isinstance(found, Reflected) and found.pose is not None:
+                cdr.append((self._define(_translated(topic, f"{topic.name}/pose", found.pose)), found.pose))
             recorded = (*topic.metadata, (RECORDED_KEY, topic.name))
             number = self.channels[topic] = self._define(replace(topic, name=f"{topic.name}/as_recorded", metadata=recorded))
-            self._reflected[number] = cdr, found
-            si = "rad/s and m/s^2" if found.schema_name == schemas.IMU else "metres"
-            units = f"{found.units}, as the schema states" if found.units else si
-            note = f"{topic.name}: {topic.message_encoding} became {found.schema_name}, taken as {units}"
-            self._source.remarks.notes.append(note if found.stamp else f"{note}; at the {LOG_TIME}, {WITHOUT_STAMP}")
+            self._reflected[number] = cdr
+            self._source.remarks.notes.append(reflection_note(topic, found))
             return number
         kind = self._source.kinds.get(topic.name)
         marked = topic if kind is None else replace(topic, metadata=(*topic.metadata, (KIND_KEY, kind)))
@@ -187,7 +186,8 @@ class _Stream:
         made = f"{topic.name}/{found.ending}" if found else ""
         if found is not None and made not in self._source.counts:  # which it is in a log that was converted before
             marks = ((KIND_KEY, self._source.kinds.get(made, pose_kind(topic.name))),) if found.ending == "pose" else ()
-            self._reflected[number] = self._define(MessageTopic(made, found.schema_name, "ros2msg", b"", "cdr", marks)), found
+            channel = self._define(MessageTopic(made, found.schema_name, "ros2msg", b"", "cdr", marks))
+            self._reflected[number] = [(channel, found)]
             self._made_of.add(topic.name)
             self._source.remarks.notes.append(f"{made} is made of {topic.name}, in FLU and ENU")
 
@@ -199,27 +199,20 @@ class _Stream:
 
     def _put_as_cdr(self, number: int, topic: MessageTopic, log_time: int, publish_time: int, payload: bytes) -> None:
         """Put the sample in a message of a reflected IMU or pose, ahead of the message itself."""
-        channel, reflected = self._reflected[number]
-        try:
-            sample = reflected.sample(payload, log_time)
-        except ValueError:
-            self._lacking[topic.name] += 1
-            return
-        self._put(channel, log_time, publish_time, reflected.encode([sample]).tobytes())  # type: ignore[list-item]  # its own
+        for channel, reflected in self._reflected[number]:
+            try:
+                sample = reflected.sample(payload, log_time)
+            except ValueError:
+                self._lacking[topic.name] += 1
+                continue
+            self._put(channel, log_time, publish_time, reflected.encode([sample]).tobytes())  # type: ignore[list-item]  # its own
 
 
-def _reflected(topic: MessageTopic, first: bytes) -> Reflected | Transforms | None:
-    """Fields of an IMU or poses in a topic of another encoding; None for the original of a translated topic.
-
-    Raises:
-        ConfigError: its messages are protobuf, which is not installed.
-    """
-    if RECORDED_KEY in dict(topic.metadata):
-        return None
-    try:
-        return reflect(topic.message_encoding, topic.name, topic.schema_name, topic.schema, first)
-    except ImportError as error:
-        raise not_installed("protobuf", "protobuf", where=topic.name, user="reading such messages") from error
+def _translated(topic: MessageTopic, name: str, found: Reflected | Transforms) -> MessageTopic:
+    """Topic of the IMU or the poses in another topic's messages."""
+    kind = (named_kind if name == topic.name else computed_kind)(topic.name, topic.schema_name)
+    marks = ((KIND_KEY, kind),) if found.schema_name != schemas.IMU else ()
+    return MessageTopic(name, found.schema_name, "ros2msg", b"", "cdr", marks)
 
 
 def _write_metadata(log: LogWriter, source: MessageLog) -> None:

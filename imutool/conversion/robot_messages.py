@@ -1,4 +1,4 @@
-"""IMUs and poses in other messages of ROS 2: those of PX4, and paths.
+"""IMUs and poses in messages of other types: by their fields, of PX4, and of paths.
 
 PX4's messages (px4_msgs) are in FRD and NED, in microseconds. The topics made of them are in FLU and ENU, as those of a ULog.
 A path (nav_msgs/Path) that grows as its robot moves is a trajectory: each new one replaces the poses from its first stamp on.
@@ -15,14 +15,16 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Float64, Int64, UInt8
-from imutool.errors import LogError
+from imutool.errors import LogError, not_installed
 from imutool.geometry import quaternion
 from imutool.geometry.quaternion import FLU_FROM_FRD
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
-from imutool.mcap_io.codec.reflection import Sample
+from imutool.mcap_io.codec.reflection import BY_LOG_TIMES, LOG_TIME, WITHOUT_STAMP, Reflected, Sample, reflect
 from imutool.mcap_io.codec.ros2_definition import DescribedCdr, parse
-from imutool.recording.message_log import MessageTopic, named_kind
+from imutool.mcap_io.codec.transforms import Transforms
+from imutool.mcap_io.topics import RECORDED_KEY
+from imutool.recording.message_log import MessageLog, MessageTopic, computed_kind
 
 PACKAGE = "px4_msgs/msg/"
 WHOLE_IMUS, SINGLE_SENSORS = ("SensorCombined", "VehicleImu"), ("SensorGyro", "SensorAccel")
@@ -31,6 +33,37 @@ ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 US, BODY, WORLD = 1000, "base_link", "map"  # ns; frames of ROS
 KNOWN_FRAMES = 1, 2  # of VehicleOdometry's poses: NED, and FRD with any heading
 NUMBERS = 7  # of a pose: position, then xyzw
+
+
+def reflected_of(topic: MessageTopic, first: bytes, source: MessageLog) -> Reflected | Transforms | None:
+    """Fields of an IMU or of poses in a topic of another encoding; None of other topics.
+
+    An original whose translation the log has is one of them.
+
+    Raises:
+        ConfigError: its messages are protobuf, which is not installed.
+    """
+    if RECORDED_KEY in dict(topic.metadata):
+        return None
+    try:
+        found = reflect(topic.message_encoding, topic.name, topic.schema_name, topic.schema, first)
+    except ImportError as error:
+        raise not_installed("protobuf", "protobuf", where=topic.name, user="reading such messages") from error
+    if not isinstance(found, Reflected):
+        return found
+    return found.settled((log_time, bytes(raw)) for other, log_time, _, raw in source.messages() if other == topic)
+
+
+def reflection_note(topic: MessageTopic, found: Reflected | Transforms) -> str:
+    """What a topic became, in which units, and by which clock if its messages state none."""
+    si = "rad/s and m/s^2" if found.schema_name == schemas.IMU else "metres"
+    units = f"{found.units}, as the schema states" if found.units else si
+    note = f"{topic.name}: {topic.message_encoding} became {found.schema_name}, taken as {units}"
+    if isinstance(found, Reflected) and found.pose is not None:
+        note = f"{note}; its poses are on {topic.name}/pose"
+    if isinstance(found, Reflected) and found.stamp_unit:
+        return f"{note}; {found.stamp_path} is in {found.stamp_unit}, {BY_LOG_TIMES}"
+    return note if found.stamp else f"{note}; at the {LOG_TIME}, {WITHOUT_STAMP}"
 
 
 @dataclass(frozen=True)
@@ -125,8 +158,7 @@ def _px4(topic: MessageTopic, kind: str, schema_name: str, ending: str) -> Px4 |
 
 def pose_kind(topic: str) -> str:
     """Kind of the poses of PX4 or of a path: by the topic's name, else an estimate."""
-    kind = named_kind(re.sub(r"/fmu/out/vehicle_odometry(_v\d+)?$", "", topic), "")  # which is the EKF's
-    return "estimate" if kind == "unknown" else kind
+    return computed_kind(re.sub(r"/fmu/out/vehicle_odometry(_v\d+)?$", "", topic), "")  # which is the EKF's
 
 
 class Trajectory(NamedTuple):

@@ -13,7 +13,7 @@ from imutool.mcap_io.write import RECORD
 from imutool.recording import Recording
 from imutool.recording.message_log import KINDS, MessageLog, MessageTopic
 
-POSES = (*MESSAGE_POSES, schemas.TF)
+POSES = (*MESSAGE_POSES, schemas.TF, "geometry_msgs/msg/PoseArray")
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from imutool.log_info.pose_imu_rotation import (
     velocities_judged,
 )
 from imutool.log_info.report import Convention, TruthInfo
-from imutool.mcap_io.topics import RESTAMP
+from imutool.mcap_io.codec.decode import RESTAMP
 from imutool.recording import GRAVITY_M_S2, Imu, Recording
 
 logger = logging.getLogger(__name__)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec import UnsetType
 
 from imutool.array_types import Float64
 from imutool.cleaning.rules import saturation
@@ -93,7 +94,7 @@ def describe(log: RecoveredLog, *, check: bool) -> LogInfo:
         path=str(log.path),
         bytes=log.path.stat().st_size,
         profile=log.index.header.profile,
-        messages=sum(topic.count for topic in topics),
+        messages=sum(topic.count for topic in log.topics.values() if not topic.recorded_on),
         first_ns=first,
         last_ns=last,
         duration_s=None if first is None or last is None else (last - first) * 1e-9,
@@ -133,15 +134,13 @@ def _poses(log: Log, topic: str, known: Truth | None) -> Truth | None:
     return known if known is not None and known.topic == topic else read_truth(log, topics=[topic])
 
 
-def _times(topic: Topic) -> tuple[str, list[str]] | tuple[msgspec.UnsetType, msgspec.UnsetType]:
-    """Field that stamps the samples, and the other times, where a message holds several; the log time where it holds none."""
+def _times(topic: Topic) -> tuple[str | UnsetType, list[str] | UnsetType, str | UnsetType]:
+    """Field that stamps the samples, the other times, and its unit, where messages leave them open; else the log time."""
     found = topic.reflected
-    if not isinstance(found, Reflected) or (found.stamp and not found.other_stamps):
-        return UNSET, UNSET
-    if not found.stamp:
-        return LOG_TIME, []
-    used, *others = [".".join(map(str, path)) for path in (found.stamp[0][0], *found.other_stamps)]
-    return used.removesuffix(f".{found.stamp[0][0][-1]}") if len(found.stamp) > 1 else used, others
+    if not isinstance(found, Reflected) or (found.stamp and not found.other_stamps and not found.stamp_unit):
+        return UNSET, UNSET, UNSET
+    others = [".".join(map(str, path)) for path in found.other_stamps]
+    return found.stamp_path if found.stamp else LOG_TIME, others, found.stamp_unit or UNSET
 
 
 def _imu(
@@ -162,7 +161,7 @@ def _imu(
 
     rest = _rest(imu, block_statistics(seen(), imu.period_s or 1.0))
     whole = motion.summary(truth)
-    used, others = _times(topic)
+    used, others, unit = _times(topic)
     found = conventions(whole) if len(imu) else []
     of_motion = [*motion.constant_sensors(), *convention_warnings(whole)] if len(imu) else ["no samples"]
     of_motion = of_motion or lean_warnings(motion, whole)
@@ -174,6 +173,7 @@ def _imu(
         derived_from=derived_from,
         time=used,
         other_times=others,
+        time_unit=unit,
         stated_units=topic.reflected.units or UNSET if isinstance(topic.reflected, Reflected) else UNSET,
         samples=imu.recorded.count,
         **imu.recorded.clock()._asdict(),

@@ -67,7 +67,7 @@ class ImuInfo(Section, frozen=True, kw_only=True):
     """IMU topic: clock from the header stamps, defects, rest and noise.
 
     `time` is the field that stamps the samples and `other_times` those that do not, where the message holds several; it is `log
-    time` where the message holds none.
+    time` where the message holds none. `time_unit` is that of a field without a unit, as the log times show it.
     `stated_units` are those that the comments of a driver's own definition state. Only warnings where its encoding is unknown.
     """
 
@@ -76,6 +76,7 @@ class ImuInfo(Section, frozen=True, kw_only=True):
     derived_from: str | UnsetType = UNSET
     time: str | UnsetType = UNSET
     other_times: list[str] | UnsetType = UNSET
+    time_unit: str | UnsetType = UNSET
     stated_units: str | UnsetType = UNSET
     samples: int | UnsetType = UNSET
     rate_hz: float | UnsetType | None = UNSET

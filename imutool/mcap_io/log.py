@@ -16,24 +16,13 @@ from imutool.errors import DataError, LogError
 from imutool.file_location import Location, location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records, schemas
-from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch
+from imutool.mcap_io.codec.decode import CLEAN_FIX, ImuBatch, PoseBatch, StampCheck, check_finite
 from imutool.mcap_io.codec.joined_imu import choice_of, no_imu_fix, parse_parts, whole_of
 from imutool.mcap_io.codec.records import HEAD, keep_buffers
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.passthrough.chunk_check import KeptChunks, neighbours, unpack_together
 from imutool.mcap_io.storage.source import Source
-from imutool.mcap_io.topics import (
-    CLEAN_FIX,
-    ENCODINGS,
-    MESSAGE_POSES,
-    PART_KEY,
-    StampCheck,
-    Topic,
-    check_finite,
-    joined_topic,
-    reflected_topics,
-    topics_of,
-)
+from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES, PART_KEY, Topic, joined_topic, reflected_topics, topics_of
 from imutool.recording.message_log import COMMAND
 
 logger = logging.getLogger(__name__)
@@ -74,7 +63,7 @@ class Log:
     def _read_topics(self) -> None:
         """Reads the topics from the index; IMUs of other types may need the first messages."""
         self.topics = MappingProxyType(topics_of(self.index))
-        self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, self.firsts)})
+        self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, self.firsts, self.rows)})
 
     def __enter__(self) -> Log:
         return self
@@ -254,7 +243,7 @@ class Log:
 
     def channel_ids(self, topic: str) -> set[int]:
         """Channels of a topic; for a joined IMU those of its gyroscope."""
-        name = (found.gyro_topic if (found := self.topics.get(topic)) else "") or topic
+        name = (found.recorded_on if (found := self.topics.get(topic)) else "") or topic
         if self._ids[0] != (known := (id(self.index), len(self.index.channels))):  # asked for each of many topics
             self._ids = known, {}
             for i, channel in self.index.channels.items():

@@ -15,10 +15,11 @@ from imutool.errors import LogError
 from imutool.file_location import Location, log_name
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec import messages, schemas
+from imutool.mcap_io.codec.decode import CLEAN_FIX, StampCheck, check_finite
 from imutool.mcap_io.codec.transforms import bodies, is_still
 from imutool.mcap_io.frames import read_frames
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import CLEAN_FIX, MESSAGE_POSES, SCALARS, UNIT_KEY, VELOCITY_KEY, StampCheck, check_finite
+from imutool.mcap_io.topics import MESSAGE_POSES, SCALARS, UNIT_KEY, VELOCITY_KEY
 from imutool.mcap_io.write import own_and_user_metadata
 from imutool.processes.system import release_memory
 from imutool.recording import UNIT_QUATERNION_TOLERANCE, Imu, Poses, Recording, Scalars, unit_quaternions

@@ -1,4 +1,4 @@
-"""Topics of a log, batches of their messages, and checks of numbers and stamps."""
+"""Topics of a log, and batches of their messages."""
 
 from __future__ import annotations
 
@@ -9,26 +9,29 @@ from types import MappingProxyType
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64, Int64, Shaped, UInt8, UInt32
+from imutool.array_types import Bool, Float64, Int64, Shaped, UInt8
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, ros2_definition, schemas
 from imutool.mcap_io.codec.decode import (
+    CUT,
     ImuBatch,
     PoseBatch,
     ScalarBatch,
     TwistColumns,
+    check_finite,
     decode_imu,
     decode_poses,
     decode_scalars,
     decode_twist,
+    named,
 )
 from imutool.mcap_io.codec.joined_imu import JoinedImu, Vectors, whole_of
 from imutool.mcap_io.codec.messages import Messages, Rows
 from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
-from imutool.mcap_io.codec.transforms import Transforms, named_poses
+from imutool.mcap_io.codec.transforms import Transforms, listed_poses
 from imutool.mcap_io.index import LogIndex
 from imutool.recording.joined_imu import joined
-from imutool.recording.message_log import named_kind
+from imutool.recording.message_log import computed_kind, named_kind
 
 ENCODINGS, DESCRIBED = ("cdr", "ros1"), {("ros2msg", "cdr"), ("ros1msg", "ros1")}
 REFLECTED = ("protobuf", "json", "flatbuffer")  # encodings whose messages are searched for those of an IMU and for poses
@@ -37,13 +40,9 @@ PART_KEY = "imutool_part_of"  # channel metadata: one sensor of the IMU on that 
 RECORDED_KEY = "imutool_recorded_as"  # channel metadata: the original of the IMU on that topic
 KIND_KEY = "imutool_kind"  # channel metadata of poses: truth, estimate, odometry or unknown
 VELOCITY_KEY = "imutool_velocity_of"  # channel metadata: the world velocity of the poses on this topic
-CUT, MAX_REPEATED = "Cut the log before or after it", 0.2  # share of stamps that repeat; more come in batches
 UNIT_KEY = "unit"  # channel metadata of a scalar
 MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM, schemas.POSE_COVARIANCE)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
-CLEAN_FIX = "imutool info LOG and clean LOG show what is wrong; imutool debias --clean LOG OUT leaves it out on TOPIC/debiased"
-RESTAMP = "imutool convert LOG OUT --restamp"
-UNSET_FIX = f"A stamp of 0 is not set: {RESTAMP} takes the log times"
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class Topic:
     metadata: Mapping[str, str]
     reflected: Reflected | JoinedImu | Transforms | None = None
     own_schema: str = ""  # name in the log of the type of a reflected IMU or pose
-    gyro_topic: str = ""  # of an IMU joined of two topics, whose messages stand for its own
+    recorded_on: str = ""  # topic whose messages stand for its own: the gyro of a joined IMU, the IMU beside a pose
 
     @property
     def is_derived(self) -> bool:
@@ -154,49 +153,8 @@ def _runs(rows: Rows, schema_name: str, encoding: str) -> Iterator[tuple[Rows, s
             done = part.stop
             yield rows.where(part), layout
     except LogError as error:
-        what = f"{_named(rows, done)} is no {schema_name}: {error.what}"
+        what = f"{named(rows, done)} is no {schema_name}: {error.what}"
         raise LogError(what, expected=error.expected, fix=error.fix or ("" if error.expected else CUT)) from error
-
-
-def _named(batch: Rows | ImuBatch, row: int) -> str:
-    """A message by sequence and log time: many recorders leave the sequence at 0."""
-    return f"message {batch.sequence[row]} (log time {batch.log_time[row] * 1e-9:.3f} s)"
-
-
-def check_finite(batch: Rows | ImuBatch, fix: str = CUT, **fields: Float64[np.ndarray, "n _"]) -> None:
-    """Refuses NaN and infinity, naming the message (LogError)."""
-    for name, values in fields.items():
-        if not (good := np.isfinite(values).all(axis=1)).all():
-            row = int(np.argmin(good))
-            raise LogError(f"{_named(batch, row)} has {name} {values[row].tolist()}", expected="finite numbers", fix=fix)
-
-
-@dataclass(slots=True)
-class StampCheck:
-    """Refuses stamps that repeat or go back, across batches."""
-
-    count: int = 0
-    last: int | None = None
-    fix: str = ""  # what to do about it
-
-    def check(self, stamp_ns: Int64[np.ndarray, " n"], sequence: UInt32[np.ndarray, " n"]) -> None:
-        """Takes in the next stamps.
-
-        Raises:
-            LogError: one does not come after the one before it; the message names the message and both stamps.
-        """
-        if not len(stamp_ns):
-            return
-        before = np.concatenate([[stamp_ns[0] - 1 if self.last is None else self.last], stamp_ns[:-1]])
-        bad = stamp_ns <= before
-        if bad.any():
-            row = int(np.argmax(bad))
-            how, same = "repeats" if stamp_ns[row] == before[row] else "goes back", (stamp_ns == before).mean()
-            fix = f"{RESTAMP} spreads samples that share a stamp" if self.fix and same > MAX_REPEATED else self.fix
-            what = f"message {self.count + row} (sequence {sequence[row]}) has the stamp {stamp_ns[row]} ns, which {how}: "
-            what = f"{what}the message before has {before[row]} ns"
-            raise LogError(what, expected="stamps that increase", fix=fix if stamp_ns[row] else UNSET_FIX)
-        self.count, self.last = self.count + len(stamp_ns), int(stamp_ns[-1])
 
 
 def topics_of(index: LogIndex) -> dict[str, Topic]:
@@ -224,14 +182,19 @@ def topics_of(index: LogIndex) -> dict[str, Topic]:
 
 
 def reflected_topics(
-    index: LogIndex, topics: Mapping[str, Topic], firsts: Callable[[Collection[str]], Iterator[tuple[str, bytes]]]
+    index: LogIndex,
+    topics: Mapping[str, Topic],
+    firsts: Callable[[Collection[str]], Iterator[tuple[str, bytes]]],
+    rows: Callable[[Collection[str]], Iterator[tuple[str, Rows]]],
 ) -> dict[str, Topic]:
     """IMUs and poses among the topics whose type is not that of ROS.
 
-    `firsts` gives the first messages of some. Types of ROS 2 count only if no other IMU was recorded: drivers publish both.
+    `firsts` gives the first messages of some, `rows` all of them.
+    Types of ROS 2 count only if no other IMU was recorded: drivers publish both.
     """
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
-    found = {n: _as_ros(t, p) for n, t in topics.items() if (p := named_poses(definitions[n], t.message_encoding)) is not None}
+    lists = {name: listed_poses(definitions[name], topic.message_encoding, topic.pose_kind) for name, topic in topics.items()}
+    found = {name: _as_ros(topics[name], poses) for name, poses in lists.items() if poses is not None}
     reflected = {n: t for n, t in topics.items() if t.message_encoding in REFLECTED and RECORDED_KEY not in t.metadata}
     in_json = [name for name, topic in reflected.items() if topic.message_encoding == "json"]
     texts_of = {name: definition.data if (definition := definitions[name]) else b"" for name in reflected}
@@ -258,7 +221,24 @@ def reflected_topics(
         elif imu is not None or name in odd:  # whose bytes would be read in the order of another
             which = "two definitions" if len(texts[name]) > 1 else "another definition"
             found[name] = replace(topic, schema_name=f"{topic.schema_name} ({which})")
-    return found
+    settled = [_with_clock(topic, rows([name])) for name, topic in found.items()]
+    beside = [pose for topic in settled for pose in _poses_beside(topic)]
+    return {topic.name: topic for topic in [*settled, *(pose for pose in beside if pose.name not in topics)]}
+
+
+def _with_clock(topic: Topic, parts: Iterator[tuple[str, Rows]]) -> Topic:
+    """Topic whose stamps have the unit that its first messages show."""
+    if not isinstance(topic.reflected, Reflected):
+        return topic
+    messages = ((int(t), raw.tobytes()) for _, rows in parts for t, raw in zip(rows.log_time, rows.payload, strict=True))
+    return replace(topic, reflected=topic.reflected.settled(messages))
+
+
+def _poses_beside(imu: Topic) -> Iterator[Topic]:
+    """Poses in the messages of an IMU: an estimate, unless the topic's name says more."""
+    if isinstance(imu.reflected, Reflected) and (pose := imu.reflected.pose) is not None:
+        name, marks = f"{imu.name}/pose", {KIND_KEY: computed_kind(imu.name, imu.own_schema)}
+        yield replace(imu, name=name, schema_name=schemas.POSE, metadata=marks, reflected=pose, recorded_on=imu.name)
 
 
 def _have_one_layout(topic: Topic, texts: Collection[bytes]) -> bool:
@@ -286,7 +266,7 @@ def joined_topic(gyro: Topic, accel: Topic, rows: Callable[[str], Iterator[Rows]
     imu, _, notes = joined(gyro_ns, rates, accel_ns, forces, name, spread=False)  # the messages keep their stamps
     message = JoinedImu(gyro.cut, partial(gyro.vectors, sensor="gyro"), imu.t_ns, imu.accel)
     encoding = gyro.message_encoding if gyro.message_encoding in ENCODINGS else "cdr"
-    return Topic(name, schemas.IMU, "ros2msg", encoding, len(imu), {}, message, gyro_topic=gyro.name), notes
+    return Topic(name, schemas.IMU, "ros2msg", encoding, len(imu), {}, message, recorded_on=gyro.name), notes
 
 
 def _column(parts: Iterable[Iterator[Vectors]]) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:

@@ -27,7 +27,7 @@ KIND_WORDS = {  # in the names of topics
     "odometry": "odom|odometry|wheel|wheels|encoder|encoders",
 }
 
-TRUE_TYPES = r"^(mocap|motion_capture)\w*/"  # of messages
+TRUE_TYPES = r"^(mocap|motion_capture|gazebo)\w*/"  # of messages
 DOUBTFUL = ("estimate", "odometry", COMMAND)  # kinds of poses that no command uses unasked
 ESTIMATED = r"PoseWithCovarianceStamped$|TFMessage$|FrameTransforms?$"  # a filter states its covariance, or moves the frames
 
@@ -100,6 +100,12 @@ def named_kind(topic: str, schema_name: str) -> str:
     if re.search(r"[/.]Odometry$", f"/{schema_name}"):
         return "odometry"
     return "estimate" if re.search(ESTIMATED, schema_name) else "unknown"
+
+
+def computed_kind(topic: str, schema_name: str) -> str:
+    """Kind of poses that a sensor computes with its IMU: an estimate, unless a name says more."""
+    kind = named_kind(topic, schema_name)
+    return "estimate" if kind == "unknown" else kind
 
 
 def no_messages() -> Iterator[Message]:

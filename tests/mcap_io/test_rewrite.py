@@ -22,14 +22,14 @@ from imutool.cleaning.survey import raw_batches
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.codec import schemas as schema
-from imutool.mcap_io.codec.decode import ImuBatch, decode_imu
+from imutool.mcap_io.codec.decode import ImuBatch, StampCheck, check_finite, decode_imu
 from imutool.mcap_io.codec.encode import encode_imu, encode_vector3
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.read import read
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage.source import sha256
-from imutool.mcap_io.topics import DERIVED_KEY, StampCheck, check_finite
+from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.mcap_io.verify import verify
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording

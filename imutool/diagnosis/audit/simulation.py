@@ -93,7 +93,7 @@ def _imu_frame(log: Log, topic: str) -> str:
     """Frame of an IMU; empty for one that is joined of two topics."""
     found = log.topics[topic]
     batches = (batch for _, rows in log.rows([topic]) for batch in found.decode_imu(rows))
-    return "" if found.gyro_topic else next((_plain(batch.frame_id) for batch in batches), "")
+    return "" if found.recorded_on else next((_plain(batch.frame_id) for batch in batches), "")
 
 
 def _static_transforms(log: Log) -> dict[str, tuple[str, Mount]]:

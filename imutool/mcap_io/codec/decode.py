@@ -1,16 +1,18 @@
-"""Decode messages into columns, in one numpy pass for many messages.
+"""Decode messages into columns of numbers and stamps, and check these.
 
 Quaternions are xyzw in messages and wxyz in memory; here they change.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from imutool.array_types import Float64, Int64, UInt8, UInt32
 from imutool.errors import LogError
+from imutool.mcap_io.codec.messages import Rows
 from imutool.mcap_io.codec.schemas import (
     ACCEL,
     GYRO,
@@ -29,6 +31,10 @@ from imutool.mcap_io.codec.schemas import (
 
 _WXYZ_FROM_XYZW = [3, 0, 1, 2]
 LOST_NORM = 0.5  # of a quaternion; below, it is none
+CUT, MAX_REPEATED = "Cut the log before or after it", 0.2  # share of stamps that repeat; more come in batches
+CLEAN_FIX = "imutool info LOG and clean LOG show what is wrong; imutool debias --clean LOG OUT leaves it out on TOPIC/debiased"
+RESTAMP = "imutool convert LOG OUT --restamp"
+UNSET_FIX = f"A stamp of 0 is not set: {RESTAMP} takes the log times"
 
 
 class ImuColumns(NamedTuple):
@@ -201,3 +207,44 @@ def decode_image(message: bytes, encoding: str = "cdr") -> tuple[int, str, bytes
     row = np.frombuffer(message, np.uint8)[None, :]
     at, length = layout.data
     return int(_stamp(row, layout)[0]), layout.texts[1], message[at : at + length]
+
+
+def named(batch: Rows | ImuBatch, row: int) -> str:
+    """A message by sequence and log time: many recorders leave the sequence at 0."""
+    return f"message {batch.sequence[row]} (log time {batch.log_time[row] * 1e-9:.3f} s)"
+
+
+def check_finite(batch: Rows | ImuBatch, fix: str = CUT, **fields: Float64[np.ndarray, "n _"]) -> None:
+    """Refuses NaN and infinity, naming the message (LogError)."""
+    for name, values in fields.items():
+        if not (good := np.isfinite(values).all(axis=1)).all():
+            row = int(np.argmin(good))
+            raise LogError(f"{named(batch, row)} has {name} {values[row].tolist()}", expected="finite numbers", fix=fix)
+
+
+@dataclass(slots=True)
+class StampCheck:
+    """Refuses stamps that repeat or go back, across batches."""
+
+    count: int = 0
+    last: int | None = None
+    fix: str = ""  # what to do about it
+
+    def check(self, stamp_ns: Int64[np.ndarray, " n"], sequence: UInt32[np.ndarray, " n"]) -> None:
+        """Takes in the next stamps.
+
+        Raises:
+            LogError: one does not come after the one before it; the message names the message and both stamps.
+        """
+        if not len(stamp_ns):
+            return
+        before = np.concatenate([[stamp_ns[0] - 1 if self.last is None else self.last], stamp_ns[:-1]])
+        bad = stamp_ns <= before
+        if bad.any():
+            row = int(np.argmax(bad))
+            how, same = "repeats" if stamp_ns[row] == before[row] else "goes back", (stamp_ns == before).mean()
+            fix = f"{RESTAMP} spreads samples that share a stamp" if self.fix and same > MAX_REPEATED else self.fix
+            what = f"message {self.count + row} (sequence {sequence[row]}) has the stamp {stamp_ns[row]} ns, which {how}: "
+            what = f"{what}the message before has {before[row]} ns"
+            raise LogError(what, expected="stamps that increase", fix=fix if stamp_ns[row] else UNSET_FIX)
+        self.count, self.last = self.count + len(stamp_ns), int(stamp_ns[-1])

@@ -13,8 +13,13 @@ import numpy as np
 from imutool.mcap_io.codec.schemas import NS_PER_S
 
 STAMP = r"timestamp|stamp|time|sensor_?time"
-CLOCK = r"((hw|hardware|device|sensor|sample|imu|host|header|capture|ts)_?)?(time|timestamp|stamp|t|ts)"
+CLOCK = r"((hw|hardware|device|sensor|sample|imu|host|header|capture|ts)_?)?(time|time_?stamp|stamp|t|ts)"
 COUNTED = {rf"{CLOCK}_?ns(ec)?": 1, rf"{CLOCK}_?us(ec)?|utime": 1000}  # stamps of one number
+COUNT = rf"ticks?|{CLOCK}(_?(s(ec(ond)?s?)?|m(illi)?s(ec(ond)?s?)?))?"  # without a unit, or in one that is coarse
+UNITS_NS = {1: "ns", 1000: "us", 10**6: "ms", NS_PER_S: "s"}
+FEW, MIN_PASSED_NS = 2000, NS_PER_S // 4  # messages that show the unit at most, and the time that they take at least
+CLOCK_ERROR, LATENCY_NS = 0.02, NS_PER_S // 10  # by which a clock and its recorder differ; units do by a factor of a thousand
+MAX_SAME = 0.01  # share of the messages with a time that others have, too
 SECONDS, NANOSECONDS = ("sec", "seconds", "secs"), ("nsec", "nanos", "nanosec", "nsecs", "nanoseconds")
 WORDS = {  # in the names of fields
     "gyro": r"(angular_?velocity|gyro(scope)?|ang_?vel|rotation_?rate|angular_?rate|omega)",
@@ -119,6 +124,49 @@ def stamps_of(fields: Iterable[tuple[Path, str, Any]]) -> Iterator[tuple[tuple[P
         for pattern, size in COUNTED.items():
             if node == NUMBER and re.fullmatch(pattern, name):
                 yield ((path, size),)
+
+
+def stamp_parts(stamp_ns: int, places: Sequence[tuple[Path, int | float]]) -> Iterator[tuple[Path, float]]:
+    """Stamp as the numbers of its fields, the largest unit first."""
+    for path, size in places:
+        if isinstance(size, float):
+            yield path, stamp_ns / size
+        else:
+            count, stamp_ns = divmod(stamp_ns, size)
+            yield path, count
+
+
+def counts_in(fields: Iterable[tuple[Path, str, Any]]) -> tuple[Path, ...]:
+    """Numbers that are named as a time, in a unit that the log times may show."""
+    return tuple(path for path, name, node in fields if node == NUMBER and re.fullmatch(COUNT, name))
+
+
+def unit_ns(counts: Sequence[float], log_ns: Sequence[int]) -> int:
+    """Nanoseconds of the unit in which a clock runs as fast as the log times; else 0.
+
+    That is also the answer of a clock that shows one time for several messages.
+    """
+    passed = log_ns[-1] - log_ns[0] if log_ns else 0
+    if passed < MIN_PASSED_NS or not np.isfinite(counts).all() or len({*counts}) < (1.0 - MAX_SAME) * len(counts):
+        return 0
+    allowed = CLOCK_ERROR * passed + LATENCY_NS
+    return next((unit for unit in UNITS_NS if abs((counts[-1] - counts[0]) * unit - passed) < allowed), 0)
+
+
+def vector_in(fields: Sequence[tuple[Path, str, Any]], pattern: str) -> tuple[Path, Path, Path] | None:
+    """Paths of three numbers: an object with x, y and z, a list, or three fields."""
+    for path, name, node in fields:
+        if re.fullmatch(pattern, name):
+            for axes in ("xyz", "XYZ") if isinstance(node, Mapping) else ():
+                if all(node.get(axis) == NUMBER for axis in axes):
+                    return (*path, axes[0]), (*path, axes[1]), (*path, axes[2])
+            if node == VECTOR:
+                return (*path, 0), (*path, 1), (*path, 2)
+    x, y, z = (
+        next((path for path, name, node in fields if node == NUMBER and re.fullmatch(pattern, without_axis(name, axis))), None)
+        for axis in "xyz"
+    )
+    return None if x is None or y is None or z is None else (x, y, z)
 
 
 def refuse_long(raw: bytes) -> None:

@@ -11,8 +11,9 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import groupby, islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,21 +27,25 @@ from imutool.mcap_io.codec.flatbuffer import FlatBuffer
 from imutool.mcap_io.codec.formats import (
     ACCEL,
     DEPTH,
+    FEW,
     GYRO,
+    LACKS,
     MATRIX,
-    NUMBER,
     STATED,
     TEXT,
-    VECTOR,
+    UNITS_NS,
     Format,
     Json,
     Path,
     Tree,
+    counts_in,
     fields_of,
+    stamp_parts,
     stamps_of,
     unit_in,
     unit_in_name,
-    without_axis,
+    unit_ns,
+    vector_in,
 )
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
 from imutool.mcap_io.codec.schemas import GYRO_COVARIANCE, IMU, POSE, runs
@@ -51,6 +56,7 @@ ORIENTATION = r"orientation|rotation|quaternion|quat|attitude|q"
 POSE_TYPES = r"pose(?!s)|odom|truth|mocap|vicon|tracker"  # in the name of a type or topic: clouds and grids have poses too
 FRAME = r"frame_?id|frame"
 LOG_TIME, WITHOUT_STAMP = "log time", "as the messages state no stamp with its unit"
+BY_LOG_TIMES = "as the log times show"
 
 
 class Sample(NamedTuple):
@@ -68,27 +74,47 @@ class Reflected:
     schema_name: str  # of the messages in CDR: an Imu or a PoseStamped
     format: Format
     vectors: tuple[Path, ...]  # of six numbers, rates, then accelerations; or of seven, position, then wxyz
-    stamp: tuple[tuple[Path, int], ...]  # fields that add up to the stamp, with their nanoseconds
+    stamp: tuple[tuple[Path, int | float], ...]  # fields that add up to the stamp, with their nanoseconds; a float of floats
     frame: Path | None
     covariances: tuple[Path | None, ...] = ()
     other_stamps: tuple[Path, ...] = ()  # further times in the message, which do not count
     sizes: tuple[float, float] = (1.0, 1.0)  # of the rates and the accelerations of an IMU in SI, as the definition states
     units: str = ""  # that the definition states, in words
+    counts: tuple[Path, ...] = ()  # times without a unit, in a message that states no stamp; the unit that log times show
+    stamp_unit: str = ""
+    pose: Reflected | None = None  # in the messages of an IMU
+
+    @property
+    def stamp_path(self) -> str:
+        """Field of the stamp; of several the one that holds them."""
+        return ".".join(map(str, self.stamp[0][0][: len(self.stamp[0][0]) - (len(self.stamp) > 1)]))
+
+    def settled(self, messages: Iterable[tuple[int, bytes]]) -> Reflected:
+        """Fields with the stamp whose unit the log times of the first messages show, where the message states none."""
+        first = list(islice(messages, FEW if self.counts and not self.stamp else 0))
+        for path in self.counts[: len(first)]:
+            with suppress(*LACKS):
+                values = [self.format.at(self.format.parse(raw), path) for _, raw in first]
+                if unit := unit_ns(values, [log_time for log_time, _ in first]):
+                    stamp = ((path, float(unit) if any(isinstance(value, float) for value in values) else unit),)
+                    pose = self.pose and replace(self.pose, stamp=stamp, stamp_unit=UNITS_NS[unit])
+                    return replace(self, stamp=stamp, stamp_unit=UNITS_NS[unit], pose=pose)
+        return self
 
     def sample(self, raw: bytes, log_time: int) -> Sample:
-        """Sample in a message; at its log time where it has no stamp.
+        """Sample in a message; at its log time where it has no stamp: 0 is one of a clock that runs.
 
         Raises:
             ValueError: the bytes are no such message, or it lacks a field.
         """
         try:
             message, at = self.format.parse(raw), self.format.at
-            stamp_ns = sum(int(at(message, path)) * size for path, size in self.stamp)
+            stamp_ns = round(sum(type(size)(at(message, path)) * size for path, size in self.stamp))
             frame = "" if self.frame is None else str(at(message, self.frame))
             values = [float(at(message, path)) for path in self.vectors]
             if self.sizes != (1.0, 1.0):
                 values = [self.sizes[n // 3] * value for n, value in enumerate(values)]
-            return Sample(stamp_ns or log_time, frame, values)
+            return Sample(stamp_ns or (0 if self.stamp_unit else log_time), frame, values)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"the message lacks {error}") from error
 
@@ -98,7 +124,7 @@ class Reflected:
         Raises:
             ValueError: the bytes are no such message.
         """
-        return self._patched(raw, _parts(stamp_ns, self.stamp))
+        return self._patched(raw, stamp_parts(stamp_ns, self.stamp))
 
     def with_vectors(self, raw: bytes, matrices: Float64[np.ndarray, "2 3 3"]) -> bytes:
         """Message of an IMU in CDR with both vectors multiplied, written in place.
@@ -159,7 +185,7 @@ class Reflected:
             for n, stamp_ns in enumerate(columns.stamp_ns.tolist()):
                 gyro, accel = columns.gyro[n] / self.sizes[0], columns.accel[n] / self.sizes[1]
                 values = [*gyro.tolist(), *accel.tolist()]
-                fields = [*_parts(stamp_ns, self.stamp), *zip(self.vectors, values, strict=True)]
+                fields = [*stamp_parts(stamp_ns, self.stamp), *zip(self.vectors, values, strict=True)]
                 if self.frame is not None:
                     fields.append((self.frame, columns.frame_id))
                 for path, matrix in zip(self.covariances, covariances, strict=True):
@@ -167,13 +193,6 @@ class Reflected:
                         fields += [((*path, k), value) for k, value in enumerate(matrix[n].tolist())]
                 messages.append(self.format.new(fields))
         return messages
-
-
-def _parts(stamp_ns: int, places: Sequence[tuple[Path, int]]) -> Iterator[tuple[Path, int]]:
-    """Stamp in its fields, the largest unit first."""
-    for path, size in places:
-        count, stamp_ns = divmod(stamp_ns, size)
-        yield path, count
 
 
 def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: bytes | None) -> Reflected | Transforms | None:
@@ -194,7 +213,7 @@ def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: b
     if form is None or not isinstance(tree, Mapping):
         return None
     if (imu := _found(tree, form)) is not None:
-        return _in_si(imu, form)
+        return replace(_in_si(imu, form), pose=_pose(tree, form))
     return _pose(tree, form) if re.search(POSE_TYPES, f"{topic} {schema_name}".lower()) else None
 
 
@@ -231,7 +250,7 @@ def reflect_cdr(schema_name: str, schema: bytes, encoding: str = "cdr") -> Refle
     except LogError:
         return None
     found = _found(form.tree(DEPTH), form)
-    return None if found is None else _in_si(found, form)
+    return None if found is None else _in_si(found, form)  # without a pose: drivers put latitude and longitude there
 
 
 def _in_si(found: Reflected, form: Format) -> Reflected:
@@ -251,7 +270,7 @@ def _found(tree: Tree, form: Format) -> Reflected | None:
         parts.setdefault(field[0][:-1], []).append(field)
     long, short = (GYRO, ACCEL), ("[gw]", "a")  # short: ax, ay, az, gx, gy, gz
     searched = *((part, long) for part in parts.values()), (fields, long), *((part, short) for part in parts.values())
-    pairs = ((part, _vector(part, gyro), _vector(part, accel)) for part, (gyro, accel) in searched)
+    pairs = ((part, vector_in(part, gyro), vector_in(part, accel)) for part, (gyro, accel) in searched)
     part, gyro, accel = next((pair for pair in pairs if pair[1] and pair[2]), (fields, None, None))
     if gyro is None or accel is None:
         return None
@@ -261,8 +280,8 @@ def _found(tree: Tree, form: Format) -> Reflected | None:
         for pattern in (GYRO, ACCEL)
     ]
     stamp, *others = [*stamps_of(fields)] or [()]
-    unused = tuple(other[0][0] for other in others)
-    return Reflected(IMU, form, (*gyro, *accel), stamp, frame, tuple(covariances), unused)
+    unused, counts = tuple(other[0][0] for other in others), () if stamp else counts_in(fields)
+    return Reflected(IMU, form, (*gyro, *accel), stamp, frame, tuple(covariances), unused, counts=counts)
 
 
 def _pose(tree: Tree, form: Format) -> Reflected | None:
@@ -271,25 +290,11 @@ def _pose(tree: Tree, form: Format) -> Reflected | None:
     for path, name, node in fields:
         if not (isinstance(node, Mapping) and re.fullmatch(ORIENTATION, name)):
             continue
-        position = _vector([field for field in fields if field[0][:-1] == path[:-1]], POSITION)
+        position = vector_in([field for field in fields if field[0][:-1] == path[:-1]], POSITION)
         parts = next(([f"{q}{axis}" for axis in "wxyz"] for q in ("", "q") if {f"{q}{a}" for a in "wxyz"} <= node.keys()), None)
         if position is not None and parts is not None:
             frame = next((p for p, text, kind in fields if kind == TEXT and re.fullmatch(FRAME, text)), None)
-            return Reflected(POSE, form, (*position, *((*path, part) for part in parts)), next(stamps_of(fields), ()), frame)
+            stamp = next(stamps_of(fields), ())
+            vectors, counts = (*position, *((*path, part) for part in parts)), () if stamp else counts_in(fields)
+            return Reflected(POSE, form, vectors, stamp, frame, counts=counts)
     return None
-
-
-def _vector(fields: Sequence[tuple[Path, str, Any]], pattern: str) -> tuple[Path, Path, Path] | None:
-    """Paths of three numbers: an object with x, y and z, a list, or three fields."""
-    for path, name, node in fields:
-        if re.fullmatch(pattern, name):
-            for axes in ("xyz", "XYZ") if isinstance(node, Mapping) else ():
-                if all(node.get(axis) == NUMBER for axis in axes):
-                    return (*path, axes[0]), (*path, axes[1]), (*path, axes[2])
-            if node == VECTOR:
-                return (*path, 0), (*path, 1), (*path, 2)
-    x, y, z = (
-        next((path for path, name, node in fields if node == NUMBER and re.fullmatch(pattern, without_axis(name, axis))), None)
-        for axis in "xyz"
-    )
-    return None if x is None or y is None or z is None else (x, y, z)

@@ -18,7 +18,7 @@ from mcap.records import Schema
 from imutool.array_types import Bool, Float64, UInt8
 from imutool.errors import LogError
 from imutool.mcap_io.codec.encode import encode_transforms
-from imutool.mcap_io.codec.formats import LACKS, Format, Path
+from imutool.mcap_io.codec.formats import LACKS, MAX_ROW, Format, Path
 from imutool.mcap_io.codec.joined_imu import Cut
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
 from imutool.mcap_io.codec.ros2_definition import FORMATS, TEXT, Definition, Walk, parse
@@ -28,7 +28,8 @@ from imutool.recording.message_log import TRUE_TYPES
 TYPE = re.compile(r"(?:.*[./])?FrameTransform(s?)")
 FRAMES = "parent_frame_id", "child_frame_id"
 NUMBERS = *(("translation", axis) for axis in "xyz"), *(("rotation", axis) for axis in "wxyz")
-NAME = re.compile(r"(.*_)?name")  # of a body
+NAME, LISTED = re.compile(r"(.*_)?name"), "geometry_msgs/Pose"  # of a body
+TYPES_OF_LISTS = re.compile(r"geometry_msgs/(msg/)?PoseArray$|gazebo_msgs/(msg/)?(Model|Link)States$")
 WORLD = re.compile(r"(.*[/_])?(map|odom|world|earth)(_combined|_frame)?")
 STILL = 0.02  # of a quaternion's numbers, 2 degrees
 STAMPS = ("seconds", "nanos"), ("sec", "nsec")
@@ -49,11 +50,15 @@ def is_still(q_wb_wxyz: Float64[np.ndarray, "n 4"]) -> bool:
     return not len(q_wb_wxyz) or bool(np.ptp(q_wb_wxyz, axis=0).max() < STILL)
 
 
-class NamedPoses:
-    """Messages of ROS with a list of named poses, read as transforms."""
+class ListedPoses:
+    """Messages of ROS with a list of poses, read as transforms.
 
-    def __init__(self, definition: Definition, encoding: str, names: tuple[str, str, str]) -> None:
-        self._definition, self._encoding, self._names = definition, encoding, names
+    Their names stand in the list, or in a list of their own; `2_of_3` is the second of three poses without names.
+    """
+
+    def __init__(self, definition: Definition, encoding: str, pose: str, name: str) -> None:
+        self._definition, self._encoding, self._pose = definition, encoding, pose  # paths; of a name as a pattern
+        self._name = re.compile(name)
 
     def parse(self, raw: bytes) -> dict[str, Any]:
         """Message as nested fields.
@@ -61,7 +66,6 @@ class NamedPoses:
         Raises:
             ValueError: the bytes are no such message.
         """
-        listed, name, pose = self._names
         try:
             walk = Walk(raw, self._definition, self._encoding)
             numbers = {
@@ -69,35 +73,40 @@ class NamedPoses:
             }
         except LogError as error:
             raise ValueError(error.what) from error
-        texts = {path: text.removesuffix(b"\0").decode(errors="replace") for path, _, text in walk.texts}
-        head: dict[str, Any] = {"parent_frame_id": texts.get("header.frame_id", "")}
+        texts = [(path, text.removesuffix(b"\0").decode(errors="replace")) for path, _, text in walk.texts]
+        head: dict[str, Any] = {"parent_frame_id": dict(texts).get("header.frame_id", "")}
         if "header.stamp.sec" in numbers:
             head["timestamp"] = {"sec": numbers["header.stamp.sec"], "nsec": numbers["header.stamp.nanosec"]}
-        found = []
-        for k in takewhile(lambda k: f"{listed}[{k}].{name}" in texts, count()):
-            at = f"{listed}[{k}]"
-            vectors = (("translation", "position", "xyz"), ("rotation", "orientation", "xyzw"))
-            parts = {to: {axis: numbers[f"{at}.{pose}.{of}.{axis}"] for axis in axes} for to, of, axes in vectors}
-            found.append({**head, "child_frame_id": texts[f"{at}.{name}"], **parts})
-        return {"transforms": found}
+        at = [*takewhile(lambda path: f"{path}.position.x" in numbers, map(self._pose.format, count()))]
+        names = [text for path, text in texts if self._name.fullmatch(path)]
+        if len(names) != len(at):
+            names = [f"{k}_of_{len(at)}" for k in range(1, len(at) + 1)] if len(at) <= MAX_ROW else []
+        vectors = (("translation", "position", "xyz"), ("rotation", "orientation", "xyzw"))
+        parts = ({to: {axis: numbers[f"{path}.{of}.{axis}"] for axis in axes} for to, of, axes in vectors} for path in at)
+        return {"transforms": [{**head, "child_frame_id": name, **part} for name, part in zip(names, parts, strict=False)]}
 
     def at(self, message: Any, path: Path) -> Any:
         """Value of a field; KeyError where the message lacks it."""
         return reduce(getitem, path, message)
 
 
-def named_poses(schema: Schema | None, encoding: str) -> Transforms | None:
-    """Poses of the bodies that a motion capture names in one message; None of any other type."""
-    if schema is None or schema.encoding not in ("ros1msg", "ros2msg") or not re.search(TRUE_TYPES, schema.name):
+def listed_poses(schema: Schema | None, encoding: str, kind: str) -> Transforms | None:
+    """Poses of several bodies in one message of true poses; None of any other type."""
+    true = schema is not None and (kind == "truth" or re.search(TRUE_TYPES, schema.name))
+    if schema is None or not true or schema.encoding not in ("ros1msg", "ros2msg"):
         return None
     with suppress(LogError):
         definition = parse(schema.name, schema.data)
-        for field in definition[definition[""][0].kind]:
-            inner = definition.get(field.kind, ()) if field.length is not None else ()
+        root = definition[definition[""][0].kind]
+        for field in (field for field in root if field.length is not None):
+            inner = definition.get(field.kind, ())
             name = next((part.name for part in inner if part.kind == TEXT and NAME.fullmatch(part.name)), None)
-            pose = next((part.name for part in inner if (part.kind, part.length) == ("geometry_msgs/Pose", None)), None)
+            pose = next((part.name for part in inner if (part.kind, part.length) == (LISTED, None)), None)
             if name and pose:
-                return Transforms(NamedPoses(definition, encoding, (field.name, name, pose)), several=True)
+                at = f"{field.name}[{{}}].{pose}", rf"{field.name}\[\d+\]\.{name}"
+                return Transforms(ListedPoses(definition, encoding, *at), several=True)
+            if field.kind == LISTED and TYPES_OF_LISTS.search(schema.name):
+                return Transforms(ListedPoses(definition, encoding, f"{field.name}[{{}}]", NAME.pattern), several=True)
     return None
 
 
@@ -113,7 +122,7 @@ class Transform(NamedTuple):
 class Transforms:
     """Messages of one or several transforms; one that lacks a field is left out."""
 
-    format: Format | NamedPoses
+    format: Format | ListedPoses
     several: bool
     schema_name: str = TF
     units: str = ""  # that the schema states

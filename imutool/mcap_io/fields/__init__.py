@@ -16,10 +16,11 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.errors import LogError, did_you_mean
 from imutool.file_location import Location
+from imutool.mcap_io.codec.decode import StampCheck
 from imutool.mcap_io.codec.messages import Rows
 from imutool.mcap_io.fields.decoders import decoder_of
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import UNIT_KEY, StampCheck, Topic, topics_of
+from imutool.mcap_io.topics import UNIT_KEY, Topic, topics_of
 
 __all__ = ["Fields", "PlainLog", "Reader", "decoder_of", "listed", "numbers", "numeric_fields", "others", "read_field", "split"]
 

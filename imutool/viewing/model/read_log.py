@@ -16,13 +16,13 @@ from imutool.cleaning.truth import truth_of
 from imutool.errors import DataError, LogError
 from imutool.file_location import Location
 from imutool.mcap_io.codec import schemas
-from imutool.mcap_io.codec.decode import ImuBatch, TwistColumns
+from imutool.mcap_io.codec.decode import UNSET_FIX, ImuBatch, TwistColumns
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import joined_column, longest_recording, read_recordings
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.temperature import with_temperatures
-from imutool.mcap_io.topics import DERIVED_KEY, UNSET_FIX
+from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.recording import Imu, Recording
 from imutool.recording.columns import clock_jumps, jump_warnings, longest_run
 from imutool.viewing.model.run_data import IN_LOG, LogTimes, Run

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.writer import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imutool.cleaning.truth import read_truth
 from imutool.conversion.run import convert
@@ -118,3 +119,59 @@ def test_joints_and_worlds_of_a_tree_are_no_bodies(tmp_path: Path, frames: Frame
         truth = read_truth(log)
     assert truth is not None
     assert truth.p_wb[:, 0].tolist() == [0.0, 10.0, 20.0, 30.0]
+
+
+MODELS = "string[] name\ngeometry_msgs/Pose[] pose\ngeometry_msgs/Twist[] twist\n"
+LISTS = {"geometry_msgs/msg/PoseArray": ["1_of_2", "2_of_2"], "gazebo_msgs/msg/ModelStates": ["wall", "drone"]}
+
+
+def list_of_poses(path: Path, topic: str, kind: str, bodies: int = 2) -> Path:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(MODELS, "gazebo_msgs/msg/ModelStates"))
+    kinds = store.types
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        text = store.generate_msgdef(kind, ros_version=2)[0].encode()
+        imus = writer.register_channel("/imu", "json", writer.register_schema("Imu", "jsonschema", b"{}"))
+        lists = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
+        for n, t in enumerate(T_NS.tolist()):
+            turned = kinds["geometry_msgs/msg/Quaternion"](np.sin(n / 99), 0.0, 0.0, np.cos(n / 99))
+            places = [(3.0, kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)), *[(float(n), turned)] * (bodies - 1)]
+            poses = [kinds["geometry_msgs/msg/Pose"](kinds["geometry_msgs/msg/Point"](x, 1.0, 2.0), q) for x, q in places]
+            stamp = kinds["builtin_interfaces/msg/Time"](t // 10**9, t % 10**9)
+            head = kinds["std_msgs/msg/Header"](stamp, "map")
+            fields = (head, poses) if kind.endswith("PoseArray") else (["wall", "drone"], poses, [])
+            message = bytes(store.serialize_cdr(kinds[kind](*fields), kind))
+            for channel, raw in ((imus, json.dumps(imu(n)).encode()), (lists, message)):
+                writer.add_message(channel, t, raw, t)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("kind", LISTS)
+def test_the_bodies_of_a_list_of_true_poses_are_told_apart(tmp_path: Path, kind: str) -> None:
+    path = list_of_poses(tmp_path / "log.mcap", "/gt/poses", kind)
+    truths = read(path).truths
+    still, moving = (f"/gt/poses/{name}" for name in LISTS[kind])
+    assert list(truths) == [moving, still]
+    assert np.array_equal(truths[moving].t_ns, T_NS)
+    assert truths[moving].p_wb.tolist() == [[float(n), 1.0, 2.0] for n in range(COUNT)]
+
+
+def test_gazebo_states_are_true_by_their_type(tmp_path: Path) -> None:
+    with Log(list_of_poses(tmp_path / "log.mcap", "/states", "gazebo_msgs/msg/ModelStates")) as log:
+        assert log.truth_topics == ["/states"]
+
+
+def test_an_array_of_poses_counts_if_it_is_named_true(tmp_path: Path) -> None:
+    """Most are goals, detections or particles."""
+    path = list_of_poses(tmp_path / "log.mcap", "/array", "geometry_msgs/msg/PoseArray")
+    assert not read(path).truths
+    convert(path, tmp_path / "true.mcap", kinds=["/array=truth"])
+    assert list(read(tmp_path / "true.mcap").truths) == ["/array/2_of_2", "/array/1_of_2"]
+
+
+def test_a_cloud_of_poses_holds_no_bodies(tmp_path: Path) -> None:
+    path = list_of_poses(tmp_path / "log.mcap", "/gt/poses", "geometry_msgs/msg/PoseArray", bodies=100)
+    assert not read(path).truths
