@@ -20,6 +20,7 @@ from imutool.geometry import quaternion
 from imutool.geometry.quaternion import FLU_FROM_FRD
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
+from imutool.mcap_io.codec.formats import MAX_PASSED_NS
 from imutool.mcap_io.codec.reflection import BY_LOG_TIMES, LOG_TIME, WITHOUT_STAMP, Reflected, Sample, reflect
 from imutool.mcap_io.codec.ros2_definition import DescribedCdr, parse
 from imutool.mcap_io.codec.transforms import Transforms
@@ -51,7 +52,18 @@ def reflected_of(topic: MessageTopic, first: bytes, source: MessageLog) -> Refle
         raise not_installed("protobuf", "protobuf", where=topic.name, user="reading such messages") from error
     if not isinstance(found, Reflected):
         return found
-    return found.settled((log_time, bytes(raw)) for other, log_time, _, raw in source.messages() if other == topic)
+    return found.settled(_first_messages(source, topic))
+
+
+def _first_messages(source: MessageLog, topic: MessageTopic) -> Iterator[tuple[int, bytes]]:
+    """Log times and contents of the first messages of a topic, as long as they may show a unit."""
+    end_ns = None
+    for other, log_time, _, raw in source.messages():
+        if end_ns is not None and log_time > end_ns:
+            return
+        if other == topic:
+            end_ns = log_time + MAX_PASSED_NS if end_ns is None else end_ns
+            yield log_time, bytes(raw)
 
 
 def reflection_note(topic: MessageTopic, found: Reflected | Transforms) -> str:

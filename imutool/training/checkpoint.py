@@ -1,4 +1,4 @@
-"""Trainings with a checkpoint on the way: tensors in safetensors, the rest in its JSON header."""
+"""Trainings with checkpoints: tensors in safetensors, the rest in its JSON header."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ CLOCK = r"((hw|hardware|device|sensor|sample|imu|host|header|capture|ts)_?)?(tim
 COUNTED = {rf"{CLOCK}_?ns(ec)?": 1, rf"{CLOCK}_?us(ec)?|utime": 1000}  # stamps of one number
 COUNT = rf"ticks?|{CLOCK}(_?(s(ec(ond)?s?)?|m(illi)?s(ec(ond)?s?)?))?"  # without a unit, or in one that is coarse
 UNITS_NS = {1: "ns", 1000: "us", 10**6: "ms", NS_PER_S: "s"}
-FEW, MIN_PASSED_NS = 2000, NS_PER_S // 4  # messages that show the unit at most, and the time that they take at least
+FEW, MIN_PASSED_NS, MAX_PASSED_NS = 2000, NS_PER_S // 4, 10 * NS_PER_S  # messages that show the unit, and their time
 CLOCK_ERROR, LATENCY_NS = 0.02, NS_PER_S // 10  # by which a clock and its recorder differ; units do by a factor of a thousand
 MAX_SAME = 0.01  # share of the messages with a time that others have, too
 SECONDS, NANOSECONDS = ("sec", "seconds", "secs"), ("nsec", "nanos", "nanosec", "nsecs", "nanoseconds")
@@ -139,6 +139,16 @@ def stamp_parts(stamp_ns: int, places: Sequence[tuple[Path, int | float]]) -> It
 def counts_in(fields: Iterable[tuple[Path, str, Any]]) -> tuple[Path, ...]:
     """Numbers that are named as a time, in a unit that the log times may show."""
     return tuple(path for path, name, node in fields if node == NUMBER and re.fullmatch(COUNT, name))
+
+
+def beginning(messages: Iterable[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+    """First messages, with their log times: a slow topic may lie in every chunk of a long log."""
+    found = list[tuple[int, bytes]]()
+    for message in islice(messages, FEW):
+        found.append(message)
+        if message[0] - found[0][0] > MAX_PASSED_NS:
+            break
+    return found
 
 
 def unit_ns(counts: Sequence[float], log_ns: Sequence[int]) -> int:

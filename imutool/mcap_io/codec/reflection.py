@@ -13,7 +13,7 @@ import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import groupby, islice
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +27,6 @@ from imutool.mcap_io.codec.flatbuffer import FlatBuffer
 from imutool.mcap_io.codec.formats import (
     ACCEL,
     DEPTH,
-    FEW,
     GYRO,
     LACKS,
     MATRIX,
@@ -38,6 +37,7 @@ from imutool.mcap_io.codec.formats import (
     Json,
     Path,
     Tree,
+    beginning,
     counts_in,
     fields_of,
     stamp_parts,
@@ -91,7 +91,7 @@ class Reflected:
 
     def settled(self, messages: Iterable[tuple[int, bytes]]) -> Reflected:
         """Fields with the stamp whose unit the log times of the first messages show, where the message states none."""
-        first = list(islice(messages, FEW if self.counts and not self.stamp else 0))
+        first = beginning(messages) if self.counts and not self.stamp else []
         for path in self.counts[: len(first)]:
             with suppress(*LACKS):
                 values = [self.format.at(self.format.parse(raw), path) for _, raw in first]
