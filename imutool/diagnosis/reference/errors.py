@@ -40,11 +40,12 @@ Matrix = Float64[np.ndarray, "3 3"]
 Vector = Float64[np.ndarray, "3"]
 
 
-def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -> tuple[list[Finding], tuple[Located, ...]]:
+def reference_errors(logs: Sequence[WhitenedImu]) -> tuple[list[Finding], tuple[Located, ...]]:
     """Intervals of a wrong reference, as a finding and locations; of shocks their locations."""
     if len(logs) != 1:
         return [], ()
-    (log,), block_s, p_value = logs, settings.block_s, settings.p_value
+    (log,), settings = logs, logs[0].pair.settings.reference
+    block_s, p_value = settings.block_s, settings.p_value
     rows = log.rows("all")
     if not rows.any():
         return [], ()
@@ -178,7 +179,7 @@ SMOOTHED = Effect(
 # ── an attitude that is turned throughout ──
 
 
-def turned_reference(logs: Sequence[WhitenedImu], chosen: Chosen, settings: ReferenceSettings) -> list[Finding]:
+def turned_reference(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Finding]:
     """Finding of poses whose attitude is turned by a constant rotation; none for another misfit.
 
     Means over seconds of the gyro's residual are r = b + turned x omega, those of the accelerometer b + turned x f; the two
@@ -186,7 +187,8 @@ def turned_reference(logs: Sequence[WhitenedImu], chosen: Chosen, settings: Refe
     """
     if any(log.pair.exact or log.pair.ideal.R_wb is None for log in logs) or len({log.pair.name for log in logs}) > 1:
         return []
-    means = [_slow_means(log, chosen, settings.turned_block_s) for log in logs]
+    settings = logs[0].pair.settings.reference
+    means = [_slow_means(log, chosen) for log in logs]
     residual, signal = (np.concatenate([part[k] for part in means]) for k in (0, 1))
     if len(residual) < settings.min_turned_blocks:
         return []
@@ -212,12 +214,10 @@ def turned_reference(logs: Sequence[WhitenedImu], chosen: Chosen, settings: Refe
     return [Finding("reference_error", "both", share, p_value, p_value, parameters, "R_ref = R_wb Exp(turned)", held_out)]
 
 
-def _slow_means(
-    log: WhitenedImu, chosen: Chosen, block_s: float
-) -> tuple[Float64[np.ndarray, "b 6"], Float64[np.ndarray, "b 6"]]:
+def _slow_means(log: WhitenedImu, chosen: Chosen) -> tuple[Float64[np.ndarray, "b 6"], Float64[np.ndarray, "b 6"]]:
     """Means of the residual and of the expected samples over blocks that are usable throughout."""
     pair, model = log.pair, expected(log.pair, chosen)
-    count = round(block_s / pair.period_s)
+    count = round(pair.settings.reference.turned_block_s / pair.period_s)
     blocks = len(model) // count
     usable = np.asarray(pair.usable.all(axis=1), dtype=float)[: blocks * count]
     used = np.flatnonzero(usable.reshape(blocks, count).mean(axis=1) > MOSTLY)

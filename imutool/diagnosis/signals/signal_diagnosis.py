@@ -165,7 +165,7 @@ def _refined(log: WhitenedLog, selection: Selection, settings: DiagnoseSettings)
         for s in (selection.fitted, selection.whole)
     ]
     fitted, whole = fit([log], chosen[0]), fit([log], chosen[1], part="all")
-    stds = scatter([log], whole, "all", settings.search.robust_block_s).std
+    stds = scatter(whole).std
     effects = {effect.key: (effect, theta) for effect, theta in whole.chosen}
     selected = [
         replace(s, effect=effects[s.effect.key][0], theta=effects[s.effect.key][1], std=stds[s.effect.key])
@@ -238,7 +238,7 @@ def _summarized(
         each = zip(findings, selection.selected, strict=True)
         findings = [with_learnt_error(finding, selected.effect, errors) for finding, selected in each]
     p_values = {name: min((f.p_value for f in findings if f.signal in (name, pair.name)), default=1.0) for name in names}
-    place = partial(locate_findings, [pair], [before], [after], level, (), p_values, settings.localization)
+    place = partial(locate_findings, [pair], [before], [after], level, (), p_values)
     floor = level.copy()
     for k in range(pair.columns):
         if lsb[k] > settings.timestamps.min_digits * float(level[k]):
@@ -252,7 +252,7 @@ def _summarized(
         floor = level = np.hypot(
             level, MODEL_ERROR * np.array([held_out_rms(logs, [before], [before], n).rms_before for n in names])
         )
-    unexplained = unexplained_residuals(logs, [after], floor, settings.held_out)
+    unexplained = unexplained_residuals(logs, [after], floor)
     maximum = settings.held_out.max_white_ratio
     beyond = any(not residual.white and residual.rms > maximum * residual.noise_floor for residual in unexplained.values())
     gains = {f.signal: f.parameters["gain"].value for f in findings if f.effect == "actuator_gain"}
@@ -291,4 +291,4 @@ def _unseen(log: WhitenedLog, candidates: Sequence[Effect], selection: Selection
     for effect in candidates:
         if effect.key not in found:
             columns = f" of {', '.join(effect.sensors)}" if 0 < len(effect.sensors) < log.pair.columns else ""
-            yield from (f"{name}{columns}" for name in unobservable([log], [effect], settings.search))
+            yield from (f"{name}{columns}" for name in unobservable([log], [effect]))
