@@ -200,7 +200,7 @@ def read_log(log: Location, *, imu: str | None, truth: str | None = None) -> Rec
 
 def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: Selection, sim: Recording) -> Diagnosis:
     """Adds the gain of a second simulation, or the reason why there is none."""
-    if any(finding.effect == summarize.JITTER for finding in diagnosis.findings):  # jitter of stamps is not simulated
+    if any(finding.effect == timestamps.JITTER for finding in diagnosis.findings):  # jitter of stamps is not simulated
         return diagnosis
     try:
         clock = selection.fitted.chosen[: selection.always]

@@ -135,9 +135,9 @@ def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Find
             lsb[signal] = float(np.median(grids))
     if not lsb:
         return []
-    signal = "both" if len(lsb) > 1 else next(iter(lsb))
+    of = "both" if len(lsb) > 1 else next(iter(lsb))
     parameters = {f"{name}_lsb": Estimate(value, 1e-3 * value, UNITS[name]) for name, value in lsb.items()}
-    return [by_samples(pairs, "quantization", signal, parameters, "values are multiples of an LSB")]
+    return [by_samples(pairs, "quantization", of, parameters, "values are multiples of an LSB")]
 
 
 def grid(x: Float64[np.ndarray, " n"], settings: TimestampSettings = DEFAULT.timestamps) -> float:

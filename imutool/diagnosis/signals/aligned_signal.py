@@ -120,6 +120,7 @@ class AlignedSignal(AlignedLog):
         known = self.stamp_s - self.ideal.start_s > length_s
         return replace(self, fitted=self.fitted & known, held_out=self.held_out & known)
 
+    @cached_property
     def scale(self) -> Scale:
         """Sizes from which effects take their plausible parameters."""
         sampled, relation = self.sampled, self.ideal.relation

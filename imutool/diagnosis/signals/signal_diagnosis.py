@@ -138,10 +138,10 @@ class _Prepared(NamedTuple):
             always = (*always, *((effect, np.ones(1)) for effect in candidates if effect.name == GAIN))
             candidates = [effect for effect in candidates if effect.name != GAIN]
         if not signal.shares_epoch:
-            always = ((common.delay(0.0, common.delay_step_s(signal)), np.zeros(1)), *always)
+            always = ((common.delay(signal, "delay", 0.2), np.zeros(1)), *always)
             candidates = [effect for effect in candidates if effect.name not in DELAYS]
         elif signal.clock_std_s and not pair.sim_state:
-            always = ((common.clock(signal.clock_std_s, common.delay_step_s(signal)), np.zeros(1)), *always)
+            always = ((common.delay(signal, "clock", signal.clock_std_s), np.zeros(1)), *always)
         log = whitened(signal, np.stack([rich_residual(signal, k) for k in columns], axis=1), lsb)
         return cls(log, candidates, always, lsb)
 
@@ -216,9 +216,8 @@ def _beside_stiction(prepared: _Prepared, found: Selection, driven: Sequence[Eff
 
 def catalogue(signal: AlignedSignal) -> list[Effect]:
     """Effects that a signal can have by name."""
-    scale = signal.scale()
     any_signal = common.named(signal) if signal.columns == 1 else ()
-    return [*any_signal, *(effect for effects in CATALOGUE.get(signal.kind, ()) for effect in effects(scale))]
+    return [*any_signal, *(effect for effects in CATALOGUE.get(signal.kind, ()) for effect in effects(signal.scale))]
 
 
 # ── report ──
