@@ -84,7 +84,8 @@ def longest_pair(log: Path, truth: str | None) -> tuple[Recording, Pair]:
         recording = recording.with_truth(next(iter(recording.truths)))
     motion = smooth_motion(recording.truth)
     felt = max(motion.ideal_motions(1.0 / recording.imu.period_s), key=lambda one: len(one.t_s))
-    return recording, with_truth(recording, felt, motion.start_ns, FAST_HZ)
+    since_s = 1e-9 * (motion.start_ns - int(recording.imu.t_ns[0]))
+    return recording, with_truth(recording, replace(felt, t_s=felt.t_s + since_s), FAST_HZ)
 
 
 def position_lags_s(pair: Pair) -> Iterator[tuple[float, float]]:

@@ -72,8 +72,11 @@ def reference_errors(logs: Sequence[WhitenedImu]) -> tuple[list[Finding], tuple[
     excess = (white[inside] ** 2).sum() - 6.0 * inside.sum()
     share = float(np.clip(excess / max(float((white**2).sum() - 6.0 * len(white)), 1e-300), 0.0, 1.0))
     shock = _is_shock(log, runs)
+    own = "no regime: shocks of the recording" if shock else "no regime: the reference's own moments"
     places = tuple(
-        _where(signal, white[:, 3 * k : 3 * k + 3], inside, runs, share, p_value, shock) for k, signal in enumerate(SENSORS)
+        Located(signal, axes or AXES, tuple(runs), own, share, p_value, extent="intermittent")
+        for signal, squares in zip(SENSORS, (white[inside] ** 2).mean(axis=0).reshape(2, 3), strict=True)
+        for axes in [tuple(axis for axis, value in zip(AXES, squares, strict=True) if value > 1.3)]
     )
     if shock:
         return [], places
@@ -107,20 +110,6 @@ def _is_shock(log: WhitenedImu, runs: Sequence[tuple[float, float]]) -> bool:
     misfit = misfit - np.median(misfit, axis=0)
     shaken, missed = ((x[inside] ** 2).mean(axis=0) - (x[~inside] ** 2).mean(axis=0) for x in (fast, misfit))
     return all(shaken[part].sum() > FAST_SHARE * missed[part].sum() for part in pair.signals.values())
-
-
-def _where(
-    signal: str,
-    white: Float64[np.ndarray, "n 3"],
-    inside: np.ndarray,
-    runs: list[tuple[float, float]],
-    share: float,
-    p_value: float,
-    shock: bool,
-) -> Located:
-    axes = tuple(axis for axis, value in zip(AXES, (white[inside] ** 2).mean(axis=0), strict=True) if value > 1.3)
-    own = "shocks of the recording" if shock else "the reference's own moments"
-    return Located(signal, axes or AXES, tuple(runs), f"no regime: {own}", share, p_value, extent="intermittent")
 
 
 def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list[tuple[float, float]]:

@@ -46,7 +46,7 @@ def offset(signal: AlignedSignal, k: int) -> Effect:
 
 
 def delay(signal: AlignedSignal, name: str, std_s: float, lag_s: float = 0.0) -> Effect:
-    """A delay, positive where the recording comes late: of this deviation, at first sight `lag_s`."""
+    """A delay, positive where the recording comes late; at first sight it is `lag_s`."""
     starts = [np.zeros(1)] if abs(lag_s) < 1e-9 else [np.zeros(1), np.array([lag_s])]
     numbers = (Parameter("delay", "s", std_s, step=delay_step_s(signal)),)
     text, columns = "y(t) = x(t - delay)", signal.scale.columns
