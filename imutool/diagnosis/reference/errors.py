@@ -28,6 +28,7 @@ from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located
 from imutool.diagnosis.settings import ReferenceSettings
 from imutool.recording import Recording
+from imutool.recording.columns import true_ranges
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import IdealMotion
@@ -114,10 +115,9 @@ def _is_shock(log: WhitenedImu, runs: Sequence[tuple[float, float]]) -> bool:
 
 def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list[tuple[float, float]]:
     """Stretches of loud blocks (s), those close to one another joined."""
-    edges = np.diff(np.concatenate([[0], loud.astype(int), [0]]))
     out: list[tuple[float, float]] = []
-    for first, last in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
-        begin, end = start_s + float(first) * settings.block_s, start_s + float(last) * settings.block_s
+    for first, last in true_ranges(loud):
+        begin, end = start_s + first * settings.block_s, start_s + last * settings.block_s
         if out and begin - out[-1][1] < settings.join_s:
             out[-1] = out[-1][0], end
         else:
