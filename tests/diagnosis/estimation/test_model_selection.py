@@ -422,10 +422,8 @@ def test_the_first_effect_that_goes_in_any_case_is_the_one_that_all_verdicts_nam
         planted.catalogue(),
     )
     now = fit(logs, planted.acting({"gyro_scale": [0.02, 0.0, 0.01], "accel_scale": [0.0] * 3, "clock_offset": [0.0]}))
-    known, settings = Candidates(logs, candidates), logs[0].pair.settings.search
-    search = model_selection._Search(
-        logs, candidates, (), (), settings, lambda word: None, known, before=fit(logs, ()).objective
-    )
+    known = Candidates(logs, candidates)
+    search = model_selection._Search(logs, candidates, (), (), lambda word: None, known, before=fit(logs, ()).objective)
     short = search.tested(now)
     monkeypatch.setattr(verdicts, "FOLLOWING", frozenset(now.keys))  # whatever it is, the others may matter to it
     whole = search.tested(now)
@@ -456,12 +454,11 @@ def test_of_what_comes_after_a_refuted_effect_only_a_bound_is_asked_unless_it_co
     model_error: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truth = {"clock_offset": [0.001], "gyro_scale": [0.02, 0.0, 0.01], "lever_arm": [0.1, -0.1, 0.05]}
-    log = planted.weighed(planted.pair(planted.rich(4, DURATION_S), truth, 4))
+    pair = planted.pair(planted.rich(4, DURATION_S), truth, 4)
+    search_settings = msgspec.structs.replace(pair.settings.search, model_error=model_error)
+    log = planted.weighed(replace(pair, settings=msgspec.structs.replace(pair.settings, search=search_settings)))
     candidates, now = planted.catalogue(), fit([log], planted.acting(truth), part="all")
-    settings, asked_of = (
-        msgspec.structs.replace(log.pair.settings.search, model_error=model_error),
-        list[tuple[int, int | None]](),
-    )
+    asked_of = list[tuple[int, int | None]]()
 
     def recorded(whole: Fit, k: int, iterations: int | None = None) -> tuple[float, float]:
         asked_of.append((k, iterations))
@@ -469,7 +466,7 @@ def test_of_what_comes_after_a_refuted_effect_only_a_bound_is_asked_unless_it_co
 
     monkeypatch.setattr(verdicts, "gain_of", recorded)
     known = Candidates([log], candidates)
-    search = model_selection._Search([log], candidates, (), (), settings, lambda word: None, known, before=0.0)
+    search = model_selection._Search([log], candidates, (), (), lambda word: None, known, before=0.0)
     offset, *_ = search.verdicts(now, 0, Forked(lambda: 1))
     assert (offset.false_discovery_rate == 1.0) == (model_error == 0.5)
     assert asked_of == [(0, 1), (0, None), (1, 0), (2, 0), *([(1, None), (2, None)] if model_error == 0.5 else [])]
@@ -479,9 +476,9 @@ def test_of_what_comes_after_a_refuted_effect_only_a_bound_is_asked_unless_it_co
 def test_unseen_time_is_not_waited_for_where_chance_explains_the_first_effect() -> None:
     truth = {"gyro_scale": [0.02, 0.0, 0.01]}
     log = planted.weighed(planted.pair(planted.rich(4, DURATION_S), truth, 4))
-    candidates, settings = planted.catalogue(), log.pair.settings.search
+    candidates = planted.catalogue()
     known = Candidates([log], candidates)
-    search = model_selection._Search([log], candidates, (), (), settings, lambda word: None, known, before=0.0)
+    search = model_selection._Search([log], candidates, (), (), lambda word: None, known, before=0.0)
 
     def unseen() -> int:
         raise AssertionError("nobody needs it")
@@ -911,10 +908,8 @@ def test_a_name_that_leaves_no_more_takes_the_place_of_a_term() -> None:
     pair = planted.pair(planted.planar(), {"accel_misalignment": [0.0, 0.0, 0.06, 0.0, 0.0, 0.0]})
     log, named = planted.weighed(pair), planted.catalogue()
     term = next(effect for effect in unnamed.terms(unnamed.like([pair])) if effect.equation == "accel.y += c f_x")
-    known, settings = Candidates([log], (*named, term)), pair.settings.search
-    search = model_selection._Search(
-        [log], named, (term,), (), settings, lambda text: None, known, before=fit([log], ()).objective
-    )
+    known, before = Candidates([log], (*named, term)), fit([log], ()).objective
+    search = model_selection._Search([log], named, (term,), (), lambda text: None, known, before=before)
     assert list(search.simplified(fit([log], ((term, np.zeros(1)),))).keys) == ["accel_misalignment"]
 
 
