@@ -24,6 +24,7 @@ from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.model_choice import bound_to, check_start, estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
+from imutool.exporting.tum import write_trajectory
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids, parse_aids
 from imutool.inertial.metrics import Figures
@@ -171,7 +172,7 @@ def _evaluated(
                 label = name if kind == PURE else f"{name}_{kind}"
                 for side, named in enumerate((label, TRUTH) if (name, kind) == (RAW, PURE) else (label,)):
                     parts = (block.scored()[side] for block in estimate())
-                    metrics.write_trajectory(parts, trajectories, recording.name, named, overwrite)
+                    write_trajectory(parts, trajectories, recording.name, named, overwrite)
         del estimates, estimate
         drifted = _drift(samples, span, model, start, recording.imu, has_positions=scores[0]["ape_m"] is not None)
         drifted |= _without_delay(whole_log, span, recording, drifted[DRIFTS[0]]) if model else Figures.fromkeys(DELAY)

@@ -13,10 +13,10 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, free
+from imutool.diagnosis.estimation.noise_estimate import axis_squares
 from imutool.diagnosis.estimation.observability import exclude_each_other, values_of
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.unnamed_effects import plausible_part
@@ -135,19 +135,10 @@ def _by_log(whole: Fit) -> Iterator[Fit]:
 
 def _missed(own: Fit, whole: Fit, always: int) -> float:
     """Squares that an axis of a recording loses by the numbers of all, over those that its own leave, or explain there."""
-    without, rest = fit(own.logs, own.chosen[:always], own.part), _squares(own, own.logs)
+    without, rest = fit(own.logs, own.chosen[:always], own.part), axis_squares(own)
     return float(
-        ((_squares(whole, own.logs) - rest) / np.maximum(np.maximum(rest, _squares(without, own.logs) - rest), 1.0)).max()
+        ((axis_squares(whole, own.logs) - rest) / np.maximum(np.maximum(rest, axis_squares(without) - rest), 1.0)).max()
     )
-
-
-def _squares(found: Fit, logs: Sequence[WhitenedLog]) -> Float64[np.ndarray, " k"]:
-    """Squares that a fit leaves of some of its logs, by axis."""
-    total = np.zeros(logs[0].pair.columns)
-    for log in logs:
-        k, rows = found.logs.index(log), log.rows(found.part)
-        total += ((found.residuals[k][rows] - log.constants[rows] * found.bias[k]) ** 2).sum(axis=0)
-    return total
 
 
 def _differing(own: Fit, others: Fit, found: Fit) -> str:

@@ -140,22 +140,22 @@ def _beside_reference(
     pairs, conventions = with_common_conventions(pairs, "poses" if simulated is None else "simulation")
     report(1, 4, "noise")
     candidates = candidates_for(pairs)
-    logs = whitened_stretches(pairs, lambda pair: (*for_noise(candidates), *unnamed.driven([pair])), settings.band)
+    logs = whitened_stretches(pairs, lambda pair: (*for_noise(candidates), *unnamed.driven([pair])))
     pairs = [log.pair for log in logs]
     report(2, 4, "searching")
-    wrong, places = reference_errors(logs, settings.reference)
+    wrong, places = reference_errors(logs)
     named, unnamed_groups = ((), ()) if wrong else (candidates, unnamed_candidates(pairs))
     named, always = without_unseen_offset(named, pairs)
     first, trying = start_values(begin, named), lambda word: report(2, 4, f"trying {word}")
     selection = select_effects(logs, named, unnamed_groups, trying, always=always, begin=first)
-    wrong += turned_reference(logs, selection.whole.chosen, settings.reference)
+    wrong += turned_reference(logs, selection.whole.chosen)
     if sim_selection is not None:
         selection, of_sim, small = compared(selection, sim_selection, of_sim)
         another += [small] if small else []
     report(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
-    similar, hidden = Forked(selection.similar), unobservable(logs, candidates, settings.search)
-    diagnosis = summarize.summarize(logs, selection, paths, None if sim is None else str(sim), of_sim, hidden, settings)
+    similar, hidden = Forked(selection.similar), unobservable(logs, candidates)
+    diagnosis = summarize.summarize(logs, selection, paths, None if sim is None else str(sim), of_sim, hidden)
     if simulated is not None and any(finding.effect not in NO_EFFECT for finding in diagnosis.findings):
         report(3, 4, "simulating again")
         diagnosis = _resimulated(diagnosis, logs, selection, simulated)
@@ -200,7 +200,7 @@ def read_log(log: Location, *, imu: str | None, truth: str | None = None) -> Rec
 
 def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: Selection, sim: Recording) -> Diagnosis:
     """Adds the gain of a second simulation, or the reason why there is none."""
-    if any(finding.effect == summarize.JITTER for finding in diagnosis.findings):  # jitter of stamps is not simulated
+    if any(finding.effect == timestamps.JITTER for finding in diagnosis.findings):  # jitter of stamps is not simulated
         return diagnosis
     try:
         clock = selection.fitted.chosen[: selection.always]
@@ -278,19 +278,19 @@ def effect_sizes(
     (whole,) = warn_of_recordings([recording])
     check_units(whole, f"{recording.name} {recording.imu_topic}")
     aligned = align(recording, simulated, truth, settings)
-    pairs = [without_unusable(pair, settings.reference) for pair in aligned]
+    pairs = [*map(without_unusable, aligned)]
     of_poses = {clock_wander.EFFECT.name, SMOOTHED.name} - set(effects)
     candidates = [effect for effect in candidates_for(pairs) if effect.name not in of_poses]
-    logs = whitened_stretches(pairs, lambda _: for_noise(candidates), settings.band)
+    logs = whitened_stretches(pairs, lambda _: for_noise(candidates))
     named = catalogue.diagnosed([name for name in effects if name != SMOOTHED.name])
     last_s = max(float(pair.stamp_s[-1]) for pair in pairs)
     wanted = [*clock_wander.with_knots(named, last_s), *((SMOOTHED,) if SMOOTHED.name in effects else ())]
-    hidden = set(unobservable(logs, wanted, settings.search))
+    hidden = set(unobservable(logs, wanted))
     observable = []
     for effect in wanted:
         free = [k for k, p in enumerate(effect.parameters) if not {effect.name, f"{effect.name}.{p.name}"} & hidden]
         observable += [with_free(effect, free)] if free else []
     fitted = fit(logs, tuple((effect, effect.null_value.astype(float)) for effect in observable), part="all")
-    std = scatter(logs, fitted, "all", settings.search.robust_block_s).std if observable else {}
+    std = scatter(fitted).std if observable else {}
     scatters = {key: np.asarray(s) for key, s in std.items()}
     return EffectSizes(fitted.chosen, scatters, fitted.information, fitted.bias, tuple(convention_warnings(whole)))

@@ -18,7 +18,6 @@ from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.noise_estimate import noise_std
 from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog
 from imutool.diagnosis.result import Closer, Estimate, Finding, HeldOut, Unexplained
-from imutool.diagnosis.settings import HeldOutSettings, RingingSettings
 from imutool.errors import DataError
 from imutool.recording import Recording, nanoseconds
 from imutool.sensor.effect import Acting, simulate_stretches
@@ -96,10 +95,10 @@ def unexplained_residuals(
     logs: Sequence[WhitenedLog],
     after: Sequence[Float64[np.ndarray, "_ k"]],
     noises: Float64[np.ndarray, " k"],
-    settings: HeldOutSettings,
 ) -> dict[str, Unexplained]:
     """Residuals by signal with their noise; against poses, blocks decide on whiteness."""
     out, beside_poses, signals = {}, any(log.whiten.band is not None for log in logs), logs[0].pair.signals
+    settings = logs[0].pair.settings.held_out
     for signal in known_signals(logs):
         held_out, noise = held_out_rms(logs, after, after, signal), signal_noise(logs, noises, signal)
         part = signals[signal]
@@ -112,22 +111,16 @@ def unexplained_residuals(
             p_value = float(by_chance.sf((held_out.rms_after / noise) ** 2))
         white = held_out.rms_after < maximum * noise
         if not white and beside_poses:
-            p_value = _p_value(logs, after, part, noise, settings)
+            p_value = _p_value(logs, after, part, noise)
             white = p_value > settings.white_p_value and held_out.rms_after < settings.max_white_ratio * noise
         minimum = held_out.rms_after or noise  # no noise is larger: it was measured without what the findings explain
         out[signal] = Unexplained(held_out.rms_after, min(noise, minimum), white, p_value)
     return out
 
 
-def _p_value(
-    logs: Sequence[WhitenedLog],
-    after: Sequence[Float64[np.ndarray, "_ k"]],
-    part: slice,
-    noise: float,
-    settings: HeldOutSettings,
-) -> float:
+def _p_value(logs: Sequence[WhitenedLog], after: Sequence[Float64[np.ndarray, "_ k"]], part: slice, noise: float) -> float:
     """p-value of the power of held-out blocks under white noise (Student's t over blocks)."""
-    powers: list[float] = []
+    powers, settings = list[float](), logs[0].pair.settings.held_out
     for log, model in zip(logs, after, strict=True):
         if not log.pair.axes[part].any():
             continue
@@ -150,7 +143,7 @@ def known_signals(logs: Sequence[WhitenedLog]) -> list[str]:
 # ── what rings ──
 
 
-def ringing(logs: Sequence[WhitenedImu], after: Sequence[np.ndarray], settings: RingingSettings) -> list[Finding]:
+def ringing(logs: Sequence[WhitenedImu], after: Sequence[np.ndarray]) -> list[Finding]:
     """Finding of a mount that rings after shocks, from the residual of the accelerometer alone.
 
     Shocks between two samples cannot be predicted; their free decay is seen all the same. Poles follow from the residual's
@@ -158,7 +151,7 @@ def ringing(logs: Sequence[WhitenedImu], after: Sequence[np.ndarray], settings: 
     """
     if len(logs) != 1 or not logs[0].pair.exact or not logs[0].pair.axes[3:].any():
         return []
-    (log,), rate_hz = logs, 1.0 / logs[0].pair.period_s
+    (log,), rate_hz, settings = logs, 1.0 / logs[0].pair.period_s, logs[0].pair.settings.ringing
     rows = np.asarray(log.pair.usable.any(axis=1))
     residual = np.where(log.pair.usable, log.pair.real - after[0], 0.0)[:, 3:][:, log.pair.axes[3:]]  # limits do not ring
     residual = residual - residual.mean(axis=0)

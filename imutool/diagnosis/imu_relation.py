@@ -54,9 +54,9 @@ def imu_relation(first: Recording, other: Recording, effects: Sequence[str], set
     turned = replace(first, imu=replace(a, gyro=a.gyro @ back, accel=a.accel @ back), truths={})
     pairs = with_simulation(replace(other, truths={}), turned, settings)
     chosen = tuple((effect, effect.null_value.astype(float)) for effect in catalogue.diagnosed(effects))
-    logs = [whitened(pair, [effect for effect, _ in chosen], settings.band) for pair in pairs]
+    logs = [whitened(pair, [effect for effect, _ in chosen]) for pair in pairs]
     fitted = fit(logs, chosen, part="all")
-    stds = scatter(logs, fitted, "all", settings.search.robust_block_s).std
+    stds = scatter(fitted).std
     theta = {effect.name: values for effect, values in fitted.chosen}
     phi, arm = theta["mount_rotation"], theta["lever_arm"]
 

@@ -36,12 +36,11 @@ def locate_findings(
     floor: Float64[np.ndarray, " k"],
     findings: Sequence[Finding],
     p_values: Mapping[str, float],
-    settings: LocalizationSettings,
 ) -> list[Located]:
     """Locations where the findings change the expected samples (`after` minus `before`)."""
     misfits = [_converter_output(a, findings) - b for a, b in zip(after, before, strict=True)]
-    certain = [signal for signal, p_value in p_values.items() if p_value < settings.p_value]
-    return _locate_logs(pairs, misfits, floor, p_values, settings, certain)
+    certain = [signal for signal, p_value in p_values.items() if p_value < pairs[0].settings.localization.p_value]
+    return _locate_logs(pairs, misfits, floor, p_values, certain)
 
 
 def locate_residual(
@@ -49,7 +48,6 @@ def locate_residual(
     after: Sequence[Samples],
     floor: Float64[np.ndarray, "6"],
     p_values: Mapping[str, float],
-    settings: LocalizationSettings,
 ) -> list[Located]:
     """Locations of unexplained residuals: running means beyond those of calm seconds, or all.
 
@@ -57,8 +55,9 @@ def locate_residual(
     the means, which lose a vibration. Poses show no such motion.
     """
     residuals = [pair.real - a for pair, a in zip(pairs, after, strict=True)]
-    counts = (settings.mean_samples, 1) if all(pair.exact for pair in pairs) else (settings.mean_samples,)
-    located = _locate_logs(pairs, residuals, floor, p_values, settings, p_values, averaged=counts)
+    longest = pairs[0].settings.localization.mean_samples
+    counts = (longest, 1) if all(pair.exact for pair in pairs) else (longest,)
+    located = _locate_logs(pairs, residuals, floor, p_values, p_values, averaged=counts)
     return [place for place in located if place.signal in p_values]
 
 
@@ -67,7 +66,6 @@ def _locate_logs(
     misfits: Sequence[Samples],
     floor: Float64[np.ndarray, " k"],
     p_values: Mapping[str, float],
-    settings: LocalizationSettings,
     certain: Container[str],
     averaged: Sequence[int] = (),
 ) -> list[Located]:
@@ -76,7 +74,7 @@ def _locate_logs(
     out = []
     for log in logs:
         segments = [(pair, misfit) for pair, misfit in zip(pairs, misfits, strict=True) if pair.name == log]
-        located = _locate_log(segments, floor, p_values, settings, certain, averaged)
+        located = _locate_log(segments, floor, p_values, certain, averaged)
         out += [msgspec.structs.replace(place, log=log) if len(logs) > 1 else place for place in located]
     return sorted(out, key=lambda place: place.p_value)
 
@@ -85,7 +83,6 @@ def _locate_log(
     segments: Sequence[tuple[AlignedLog, Samples]],
     floor: Float64[np.ndarray, " k"],
     p_values: Mapping[str, float],
-    settings: LocalizationSettings,
     certain: Container[str],
     averaged: Sequence[int],
 ) -> list[Located]:
@@ -95,7 +92,8 @@ def _locate_log(
     each = [pair.variables() for pair, _ in segments]
     common = set.intersection(*map(set, each))  # a channel that is constant, or starts late, is not in every segment
     variables = {n: (unit, np.concatenate([own[n][1] for own in each])) for n, (unit, _) in each[0].items() if n in common}
-    return locate(t_s, misfit, floor, variables, p_values, settings, segments[0][0].signals, certain, averaged)
+    first = segments[0][0]
+    return locate(t_s, misfit, floor, variables, p_values, first.settings.localization, first.signals, certain, averaged)
 
 
 def _converter_output(samples: Float64[np.ndarray, "n k"], findings: Sequence[Finding]) -> Float64[np.ndarray, "n k"]:

@@ -17,7 +17,7 @@ from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, without_effects
 from imutool.diagnosis.estimation.jacobians import Chosen, SplineCurve, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
-from imutool.diagnosis.estimation.timestamps import late_stamps
+from imutool.diagnosis.estimation.timestamps import JITTER, late_stamps
 from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection, without
 from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog, level
 from imutool.diagnosis.held_out import (
@@ -34,7 +34,6 @@ from imutool.diagnosis.reference.coverage import locate_stuck, unusable_axes
 from imutool.diagnosis.reference.own_poses import is_in_raw_poses
 from imutool.diagnosis.reference.taken_samples import batched
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Traces
-from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor import catalogue
@@ -42,8 +41,8 @@ from imutool.sensor.effects.vibration import IN_POSES, line_p_value, line_power,
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import AXES, SENSORS
 
-RESONANT = {"mount_resonance", "vibration", "timestamp_jitter"}
-JITTER, QUANTIZATION = "timestamp_jitter", "quantization"  # where stamps are wrong, signals are not
+RESONANT = {"mount_resonance", "vibration", JITTER}
+QUANTIZATION = "quantization"
 SHOWN_KNOTS = 41  # of a curve without a name in the report
 
 
@@ -54,7 +53,6 @@ def summarize(
     sim: str | None,
     sim_findings: Sequence[Finding],
     hidden: Sequence[str],
-    settings: DiagnoseSettings,
 ) -> Diagnosis:
     """Summarize selected effects as a diagnosis; findings shared with a simulation are left out.
 
@@ -71,7 +69,7 @@ def summarize(
     if not exact:
         all_findings += late_stamps(pairs) + vibration_above_band(logs, selection.whole.chosen)
     elif not any(finding.effect in RESONANT for finding in all_findings):
-        all_findings += ringing(logs, after, settings.ringing)
+        all_findings += ringing(logs, after)
     all_findings += batched(pairs, all_findings)
     findings, both_have = [f for f in all_findings if not shared(f, sim_findings)], remarks(all_findings, sim_findings)
     both, chosen = zip(selection.selected, named, strict=True), selection.fitted.chosen
@@ -80,11 +78,11 @@ def summarize(
     before = [with_effects(pair, tuple(entry for entry in chosen if entry[0].key in expected_too)) for pair in pairs]
     p_values = {str(signal): _p_value(findings, signal) for signal in SENSORS}
     baseline = [with_effects(pair, tuple(of for of in chosen if of[0].key in {JITTER, *expected_too})) for pair in pairs]
-    unexplained = unexplained_residuals(logs, after, noise, settings.held_out)
-    located = locate_findings(pairs, baseline, after, noise, findings, p_values, settings.localization) if findings else []
+    unexplained = unexplained_residuals(logs, after, noise)
+    located = locate_findings(pairs, baseline, after, noise, findings, p_values) if findings else []
     if not located:  # where something is left all the same, it is said where
         coloured = {signal: residual.p_value for signal, residual in unexplained.items() if not residual.white}
-        located = locate_residual(pairs, after, noise, coloured, settings.localization)
+        located = locate_residual(pairs, after, noise, coloured)
     located += [place for pair in pairs for place in locate_stuck(pair, noise, several=len(reals) > 1)]
     return Diagnosis(
         real=tuple(reals.values()),

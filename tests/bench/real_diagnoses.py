@@ -203,10 +203,10 @@ def residual_to_truth(real: Path, chosen: Chosen = ()) -> dict[str, Closer]:
     """
     settings = DiagnoseSettings()
     aligned = align(read_log(real, imu=None), None, None, settings)
-    pairs = [without_unusable(pair, settings.reference) for pair in aligned]
+    pairs = [*map(without_unusable, aligned)]
     candidates = candidates_for(pairs)
     logs = []
-    for log in (whitened(pair, candidates, settings.band) for pair in pairs):
+    for log in (whitened(pair, candidates) for pair in pairs):
         unseen = replace(log.pair, fitted=np.zeros_like(log.pair.fitted), held_out=log.pair.fitted | log.pair.held_out)
         logs.append(replace(log, pair=unseen))
     before, after = ([with_constant(log.pair, expected(log.pair, effects)) for log in logs] for effects in ((), chosen))

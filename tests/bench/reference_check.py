@@ -84,7 +84,8 @@ def longest_pair(log: Path, truth: str | None) -> tuple[Recording, Pair]:
         recording = recording.with_truth(next(iter(recording.truths)))
     motion = smooth_motion(recording.truth)
     felt = max(motion.ideal_motions(1.0 / recording.imu.period_s), key=lambda one: len(one.t_s))
-    return recording, with_truth(recording, felt, motion.start_ns, FAST_HZ)
+    since_s = 1e-9 * (motion.start_ns - int(recording.imu.t_ns[0]))
+    return recording, with_truth(recording, replace(felt, t_s=felt.t_s + since_s), FAST_HZ)
 
 
 def position_lags_s(pair: Pair) -> Iterator[tuple[float, float]]:
@@ -108,16 +109,17 @@ def arms_mm(recording: Recording) -> Iterator[str]:
     It is fitted next to what every unit has a little of.
     """
     settings = DiagnoseSettings()
-    pairs = [without_unusable(pair, settings.reference) for pair in align(recording, None, None, settings)]
+    pairs = [*map(without_unusable, align(recording, None, None, settings))]
     candidates, trusting = candidates_for(pairs), msgspec.structs.replace(settings.band, diluted_share=1.0)
     for max_hz, band in (*((hz, trusting) for hz in ARM_BANDS_HZ), (np.inf, settings.band)):
-        limited = [replace(pair, band_hz=min(pair.band_hz or max_hz, max_hz)) for pair in pairs]
-        logs = [whitened(pair, candidates, band) for pair in limited]
+        known = msgspec.structs.replace(settings, band=band)
+        limited = [replace(pair, band_hz=min(pair.band_hz or max_hz, max_hz), settings=known) for pair in pairs]
+        logs = [whitened(pair, candidates) for pair in limited]
         left_in = (*EVERY_UNIT, "clock_wander", "reference_smoothing")
         chosen = tuple((one, one.null_value.astype(float)) for one in candidates if one.name in left_in)
         found = fit(logs, chosen, part="all")
         arm = dict(zip(found.keys, (theta for _, theta in found.chosen), strict=True))["lever_arm"]
-        std = scatter(logs, found, "all", settings.search.robust_block_s).std["lever_arm"]
+        std = scatter(found).std["lever_arm"]
         reached_hz = max(log.pair.band_hz or 0.0 for log in logs)
         yield f"{1e3 * arm[2]:.1f} ± {1e3 * std[2]:.1f} ({reached_hz:.1f} Hz)"
 

@@ -13,7 +13,6 @@ from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.whitening import WhitenedImu, Whitener
 from imutool.diagnosis.held_out import noise_floor, ringing, unexplained_residuals, with_effects
 from imutool.diagnosis.result import Finding
-from imutool.diagnosis.settings import HeldOutSettings, RingingSettings
 
 SURE = 4.0
 
@@ -24,7 +23,7 @@ def found(added: np.ndarray, seed: int = 1) -> list[Finding]:
     real = pair.real.copy()
     real[:, 3:] += added
     log = planted.weighed(replace(pair, real=real))
-    return ringing([log], [expected(pair, ())], RingingSettings())
+    return ringing([log], [expected(pair, ())])
 
 
 def shocks(f0: float, zeta: float, seed: int = 3) -> np.ndarray:
@@ -72,14 +71,14 @@ def test_what_an_axis_reads_at_its_limit_does_not_ring() -> None:
     pair, beyond = planted.pair(planted.rich()), np.zeros((len(planted.clock()), 6))
     beyond[:, 3:] = shocks(7.0, 0.12)
     log = planted.weighed(replace(pair, real=pair.real + beyond, known=np.abs(beyond) < 0.1))
-    assert ringing([log], [expected(pair, ())], RingingSettings()) == []
+    assert ringing([log], [expected(pair, ())]) == []
 
 
 def test_no_noise_is_larger_than_what_is_left() -> None:
     """It is measured before the effects are known, and what a filter takes at high frequencies counted."""
     pair = planted.pair(planted.rich())
     log = WhitenedImu(pair, Whitener(np.ones((6, 1)), 5.0 * planted.NOISE))
-    left = unexplained_residuals([log], [with_effects(pair, ())], noise_floor([log]), HeldOutSettings())
+    left = unexplained_residuals([log], [with_effects(pair, ())], noise_floor([log]))
     for signal, true in zip(("gyro", "accel"), planted.NOISE[[0, 3]], strict=True):
         assert left[signal].white
         assert left[signal].noise_floor == left[signal].rms < 1.2 * true

@@ -10,7 +10,6 @@ import pytest
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.localization import locate, locate_findings, locate_residual
 from imutool.diagnosis.result import Located
-from imutool.diagnosis.settings import LocalizationSettings
 from imutool.sensor.samples import IdealMotion
 
 RATE_HZ, DURATION_S = 100.0, 40.0
@@ -69,7 +68,7 @@ def located_residual(residual: np.ndarray, rate_hz: float) -> list[Located]:
     t_s, every, nothing = np.arange(len(residual)) / rate_hz, np.ones(len(residual), bool), np.zeros_like(residual)
     ideal = IdealMotion(t_s, nothing[:, :3], nothing[:, 3:], nothing[:, :3])
     pair = Pair("log", t_s, residual, every, ~every, ideal=ideal)
-    return locate_residual([pair], [nothing], NOISE, {"gyro": 1e-9}, LocalizationSettings())
+    return locate_residual([pair], [nothing], NOISE, {"gyro": 1e-9})
 
 
 @pytest.mark.parametrize("column", range(6))
@@ -186,5 +185,5 @@ def test_a_channel_that_one_segment_lacks_is_no_variable_of_the_log() -> None:
     alone = Pair("log", T[first], NOTHING[first], every, ~every, ideal=ideal, channels={"/load": T[first]})
     pairs = [alone, Pair("log", T[~first], NOTHING[~first], every, ~every, ideal=ideal)]  # constant there
     before, misfit = [NOTHING[first], NOTHING[~first]], acting(1, np.ones(len(T), bool))
-    (one,) = locate_findings(pairs, before, [misfit[first], misfit[~first]], NOISE, [], {"gyro": 1e-9}, LocalizationSettings())
+    (one,) = locate_findings(pairs, before, [misfit[first], misfit[~first]], NOISE, [], {"gyro": 1e-9})
     assert one.intervals_s == ((0.0, DURATION_S),)

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from imutool.diagnosis.audit.bandwidth import max_filter_delays
-from imutool.diagnosis.audit.faults import FAULTS, FaultFound, found
+from imutool.diagnosis.audit.faults import CERTAIN, FAULTS, FaultFound, found
 from imutool.diagnosis.audit.motion import KinematicFit, Kinematics, kinematic_fit, kinematics, units
-from imutool.diagnosis.audit.motion_faults import CERTAIN, motion_faults, unexplained
+from imutool.diagnosis.audit.motion_faults import motion_faults, unexplained
 from imutool.diagnosis.audit.noise import Expected, noise_faults
 from imutool.diagnosis.audit.simulation import AT_BODY, Mount, read_simulation
 from imutool.diagnosis.audit.spectral_lines import SpectralLine, by_differences, spectral_lines
@@ -86,17 +86,13 @@ def audit(
     return AuditReport(str(sim), None if real is None else str(real), tuple(faults), tested, not_tested, motion_left)
 
 
-def simulator_faults(
-    sim: Recording, real: Recording | None, sheet: datasheet.Noise, mounts: tuple[Mount, Mount] = (AT_BODY, AT_BODY)
-) -> list[FaultFound]:
+def simulator_faults(sim: Recording, real: Recording | None, sheet: datasheet.Noise) -> list[FaultFound]:
     """Faults of a simulation by its own poses, and against a recording and a data sheet.
-
-    `mounts` have moved the poses of the one and the other.
 
     Raises:
         DataError: it has no poses that can be differentiated.
     """
-    return _faults(sim, real, sheet, mounts)[0]
+    return _faults(sim, real, sheet, (AT_BODY, AT_BODY))[0]
 
 
 def _faults(

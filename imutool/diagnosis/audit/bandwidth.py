@@ -9,9 +9,8 @@ import numpy as np
 from scipy.signal import spectrogram
 
 from imutool.array_types import Float64
-from imutool.diagnosis.audit.faults import FaultFound, found
+from imutool.diagnosis.audit.faults import FaultFound, clear, found
 from imutool.diagnosis.audit.motion import KinematicFit, kinematic_fit, kinematics
-from imutool.diagnosis.audit.motion_faults import clear
 from imutool.diagnosis.result import Estimate
 from imutool.recording import Recording
 from imutool.units import Sensor

@@ -19,6 +19,7 @@ class Fault:
     unless: str = ""
 
 
+CERTAIN = 6.0  # standard deviations
 GITHUB = "https://github.com"
 FAULTS: Mapping[str, Fault] = {
     "coordinate_acceleration": Fault(
@@ -156,6 +157,11 @@ class FaultFound(Section, frozen=True):
     def unless(self) -> str:
         """What would make it no fault; mostly empty."""
         return FAULTS[self.fault].unless
+
+
+def clear(estimate: Estimate, ideal: float = 0.0) -> bool:
+    """Whether an estimate differs from an ideal."""
+    return abs(estimate.value - ideal) > CERTAIN * estimate.std
 
 
 def found(fault: str, signal: str, **parameters: Estimate) -> FaultFound:

@@ -46,7 +46,7 @@ OTHER_UNIT: Mapping[Sensor, float] = {"gyro": np.pi / 180.0, "accel": 9.80665}  
 MISALIGNMENT = np.array(  # and scales of the axes: the 8 matrices of which none changes all scales alike
     [*(np.outer(a, b) for a, b in permutations(np.eye(3), 2)), np.diag([1.0, -1.0, 0.0]), np.diag([1.0, 1.0, -2.0])]
 )
-NAMES = ("m", "k", "c", "x", "y", "z", "tau_a", "tau_f")
+UNIT_OF = {**dict.fromkeys("mkc", "-"), **dict.fromkeys("xyz", "m"), "tau_a": "s", "tau_f": "s"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,11 +139,12 @@ def kinematic_fit(k: Kinematics) -> KinematicFit:
         force = np.einsum("nij,nj->ni", k.R_wb, force)
     small = np.einsum("nj,qij->niq", force, MISALIGNMENT)
     theta, std, left_accel = _solved(k, k.accel @ P_accel, columns, np.array([1.0, 1.0] + [0.0] * 6), small)
-    estimates = {name: Estimate(float(a), float(s), "-") for name, a, s in zip(NAMES, theta, std, strict=True)}
+    estimates = {name: Estimate(float(a), float(s), UNIT_OF[name]) for name, a, s in zip(UNIT_OF, theta, std, strict=True)}
     slope = k.alpha if gyro_frame == "body" else np.gradient(rates[gyro_frame], k.t_s, axis=0)
     columns = np.stack([rates[gyro_frame], -slope], axis=2)
     theta, std, left_gyro = _solved(k, k.gyro @ P_gyro, columns, np.array([1.0, 0.0]), columns[:, :, :0])
-    estimates["scale"], estimates["tau_g"] = (Estimate(float(a), float(s), "-") for a, s in zip(theta, std, strict=True))
+    of_gyro = zip(("scale", "tau_g"), ("-", "s"), theta, std, strict=True)
+    estimates |= {name: Estimate(float(a), float(s), unit) for name, unit, a, s in of_gyro}
     residual = np.concatenate([left_gyro, left_accel], axis=1)
     return KinematicFit(estimates, (gyro_frame, accel_frame), (P_gyro, P_accel), residual)
 

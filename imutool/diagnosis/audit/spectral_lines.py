@@ -94,13 +94,7 @@ def spectral_lines(
         lines = np.flatnonzero(above & found.certain & found.steady & (np.minimum(found.ratio, whole.ratio) > ABOVE))
         strongest = lines[np.argsort(-found.ratio[lines])]
         peak = maximum_filter1d(found.power, 5)  # as `Shown.at` looks for it
-        each = [(float(found.f_hz[line]), rate_hz, float(peak[line]), by_poses) for line in strongest]
-        causes = [_cause(*line) for line in each]
-        if "motion" in causes:  # a body that moves in lines has harmonics, too
-            causes = [
-                cause if cause != "sensor" or not _is_hidden(*line) else "unknown"
-                for cause, line in zip(causes, each, strict=True)
-            ]
+        causes = [_cause(float(found.f_hz[line]), rate_hz, float(peak[line]), by_poses) for line in strongest]
         first = next((cause for cause in cause_names if cause in causes), None)
         if first is not None:
             out.append(SpectralLine(sensor, float(found.f_hz[strongest[causes.index(first)]]), width_hz, first))
@@ -117,11 +111,6 @@ def _cause(f_hz: float, rate_hz: float, power: float, shown: Shown) -> Cause:
         if (near & shown.lines).any() and weaker / CLEARLY < other < CLEARLY * weaker:
             return "motion"
     return "sensor" if f_hz < KNOWN_SHARE * shown.rate_hz and expected > CLEARLY * power_shown else "unknown"
-
-
-def _is_hidden(f_hz: float, rate_hz: float, power: float, shown: Shown) -> bool:
-    """Whether the poses would not show a line, were it the fold of a faster motion."""
-    return any(weaker < CLEARLY * peak for _, weaker, peak in (shown.at(f, power) for f in (rate_hz - f_hz, rate_hz + f_hz)))
 
 
 def _spectrum(x: Float64[np.ndarray, "n 3"], rate_hz: float, size: int) -> Spectrum:

@@ -18,7 +18,7 @@ from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, effect_j
 from imutool.diagnosis.estimation.observability import WANDER, exclude_each_other, may_act, with_free
 from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.estimation.trial.effect_forms import low_pass_with
-from imutool.diagnosis.estimation.trial.lag_start import lag_taken_back
+from imutool.diagnosis.estimation.trial.filter_forms import lag_taken_back
 from imutool.diagnosis.estimation.unnamed_effects import finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.processes.forked import of_each

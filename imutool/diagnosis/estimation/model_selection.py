@@ -28,7 +28,7 @@ from imutool.diagnosis.estimation.observability import (
     without_implausible,
 )
 from imutool.diagnosis.estimation.significance import bic, gain_for, unnamed_count
-from imutool.diagnosis.estimation.trial.lag_start import (
+from imutool.diagnosis.estimation.trial.filter_forms import (
     LAGS,
     beside_offset,
     with_delay_of_accel,
@@ -61,9 +61,10 @@ def select_effects(
     Groups of `later` are tried in turn, once the candidates before explain nothing more. Effects of `always` are in every fit
     and are no findings; the search begins with those of `begin`. `progress` is called with what is being tried.
     """
-    unnamed, settings = tuple(effect for group in later for effect in group), logs[0].pair.settings.search
+    unnamed = tuple(effect for group in later for effect in group)
     start, known, report = fit(logs, always), Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
-    first = _Search(logs, tuple(candidates), unnamed, always, settings, report, known, before=start.objective)
+    first = _Search(logs, tuple(candidates), unnamed, always, report, known, before=start.objective)
+    settings = first.settings
     best_named, best_unnamed = (max((s.aic_gain for s in known.ranked(start, c)), default=0.0) for c in (candidates, unnamed))
     orders = ((), later), (unnamed, ())  # effects without a name after the others, or together with them
     order, other_order = reversed(orders) if best_unnamed > best_named + settings.clearly_better else orders
@@ -103,13 +104,13 @@ def _grown(first: _Search, base: Fit, unnamed: Sequence[Effect], later: Sequence
         gained = axis_squares(base) - axis_squares(better or base)
         if better is not None and gained.max() >= settings.negligible_share * largest[gained.argmax()]:
             largest = np.maximum(largest, gained)
-            better = with_finer_curve(search.logs, better)
+            better = with_finer_curve(better)
             if better.chosen[-1][0].name in LOW_PASSES:
-                better = with_form_of_low_pass(search.logs, better, search.named)
-                better = with_delay_of_accel(search.logs, better, search.named)
+                better = with_form_of_low_pass(better, search.named)
+                better = with_delay_of_accel(better, search.named)
             if better.chosen[-1][0].name in LAGS:
-                better = with_filter_of_each_sensor(search.logs, better, search.named)
-            better = with_form_of_resonance(search.logs, better, search.named)
+                better = with_filter_of_each_sensor(better, search.named)
+            better = with_form_of_resonance(better, search.named)
             before, base = base.objective, search.pruned(search.exchanged(search.with_always(better)))
         elif waiting:
             search = replace(search, unnamed=(*search.unnamed, *waiting.pop(0)))
@@ -151,7 +152,7 @@ class _Search(Trial):
                 limit = base.objective - (0.0 if best is None else share * (base.objective - best[1].objective))
                 self.trials[effect.key] = self.tried_with(base.chosen, effect, start, base, limit)
             added_effect, theta = (trial := self.trials[effect.key]).chosen[-1]
-            if not added_effect.parameters or beyond_the_band(added_effect, theta, self.logs, self.settings):
+            if not added_effect.parameters or beyond_the_band(added_effect, theta, self.logs):
                 continue
             log_p = partial(self.candidates.log_p, added_effect)
             own_log_p = log_p(base.objective - trial.objective)
@@ -216,13 +217,13 @@ class _Search(Trial):
             rivals = self.rivals(base.keys.index(effect.key), base).values()  # a name that leaves no more says more
             score = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
             base = next((trial for trial in rivals if score(trial) < score(base)), base)
-        base = with_delay_of_accel(self.logs, with_form_of_low_pass(self.logs, base, self.named), self.named)
-        base = with_filter_of_each_sensor(self.logs, base, self.named)
-        base = with_steady_clock(self.logs, base, self.named, self.candidates.starts)
-        base = with_plainer_effects(self.logs, base, self.named)
-        base = without_unseen_low_pass(self.logs, base, self.named, self.settings)
+        base = with_delay_of_accel(with_form_of_low_pass(base, self.named), self.named)
+        base = with_filter_of_each_sensor(base, self.named)
+        base = with_steady_clock(base, self.named, self.candidates.starts)
+        base = with_plainer_effects(base, self.named)
+        base = without_unseen_low_pass(base, self.named)
         base, log_p, maximum = self.with_always(base), self.candidates.log_p, self.threshold
-        return with_common_arm(self.logs, base, self.named, self.settings, lambda effect, gain: log_p(effect, gain) < maximum)
+        return with_common_arm(base, self.named, lambda effect, gain: log_p(effect, gain) < maximum)
 
     def pruned(self, base: Fit) -> Fit:
         """The fit without effects that the others have made superfluous."""

@@ -8,7 +8,7 @@ fit of them would start. An effect left out here would be taken for noise, and n
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -19,7 +19,7 @@ from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, expected
-from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, Whitener, level, settled, whitener
+from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, WhitenedLog, Whitener, level, settled, whitener
 from imutool.diagnosis.settings import BandSettings
 from imutool.errors import DataError
 from imutool.noise.bias_walk import INDEPENDENT
@@ -36,13 +36,13 @@ Axes = Float64[np.ndarray, " _"]
 EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the bands in which the poses are checked
 
 
-def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -> WhitenedImu:
+def whitened(pair: Pair, candidates: Sequence[Effect]) -> WhitenedImu:
     """Whitened log with its noise model; against poses also with the band that they know."""
     if pair.exact:
         residual, rate_hz = _left(pair, candidates), 1.0 / pair.period_s
         return _counting(pair, level(residual, pair.usable, rate_hz, pair.settings.noise, pair.noise_left, pair.sim_lsb))
     assert pair.band_hz is not None
-    ideal, works = expected(pair, ()), pair.axes
+    ideal, works, settings = expected(pair, ()), pair.axes, pair.settings.band
     band_hz = known_band_hz(pair.real[:, works], ideal[:, works], 1.0 / pair.period_s, pair.band_hz, settings)
     pair = replace(pair, band_hz=band_hz)
     band = Band.below(band_hz, 1.0 / pair.period_s, pair.settings.noise)
@@ -51,9 +51,7 @@ def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -
     return _counting(pair, limited_to_quiet_axes(whiten, settings.noisy_axis))
 
 
-def whitened_stretches(
-    pairs: Sequence[Pair], candidates: Callable[[Pair], Sequence[Effect]], settings: BandSettings
-) -> list[WhitenedImu]:
+def whitened_stretches(pairs: Sequence[Pair], candidates: Callable[[Pair], Sequence[Effect]]) -> list[WhitenedImu]:
     """Whitened stretches of logs; a short one among longer ones is left out with a warning.
 
     Raises:
@@ -62,7 +60,7 @@ def whitened_stretches(
     logs, refused = list[WhitenedImu](), list[str]()
     for number, pair in enumerate(pairs):
         try:
-            logs.append(whitened(pair, candidates(pair), settings))
+            logs.append(whitened(pair, candidates(pair)))
         except DataError as error:
             if not logs and number + 1 == len(pairs):
                 raise
@@ -172,10 +170,16 @@ def is_coloured_noise(effect: Effect, theta: Theta, found: Fit) -> bool:
     return all(vibration.wanders(*each) for each in zip(readings, *lines, strict=True))
 
 
-def axis_squares(found: Fit) -> Axes:
-    """Squares of white residuals by axis."""
+def white_rows(found: Fit) -> list[Float64[np.ndarray, "_ k"]]:
+    """White residuals of the fitted rows without the bias, by log."""
     each = zip(found.logs, found.residuals, found.bias, strict=True)
-    return np.asarray(sum(((r - log.constants * b)[log.rows(found.part)] ** 2).sum(axis=0) for log, r, b in each))
+    return [(r - log.constants * b)[log.rows(found.part)] for log, r, b in each]
+
+
+def axis_squares(found: Fit, only: Collection[WhitenedLog] = ()) -> Axes:
+    """Squares of white residuals by axis, of all logs or of some."""
+    each = zip(found.logs, white_rows(found), strict=True)
+    return np.asarray(sum((rows**2).sum(axis=0) for log, rows in each if not only or log in only))
 
 
 def leaves_slow_motion(found: Fit, sensor: str, squares: float) -> bool:
@@ -198,8 +202,7 @@ def _slow_squares(found: Fit) -> Axes:
 
 def kurtosis(found: Fit) -> Axes:
     """Kurtosis of white residuals by axis: 3 of normal noise, more where few samples err."""
-    each = zip(found.logs, found.residuals, found.bias, strict=True)
-    rows = np.concatenate([(r - log.constants * b)[log.rows(found.part)] for log, r, b in each])
+    rows = np.concatenate(white_rows(found))
     return np.asarray((rows**4).mean(axis=0) / np.maximum((rows**2).mean(axis=0) ** 2, 1e-300))
 
 

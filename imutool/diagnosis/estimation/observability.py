@@ -16,7 +16,6 @@ from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.significance import bic, parameter_cost
 from imutool.diagnosis.estimation.whitening import WhitenedLog
-from imutool.diagnosis.settings import SearchSettings
 from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.effect import ONCE_MORE, Effect, Theta
 from imutool.sensor.effects import low_pass, vibration
@@ -48,18 +47,18 @@ Starts = Mapping[str, Sequence[Theta]]
 # ── what the motion can show ──
 
 
-def unobservable(logs: Sequence[WhitenedLog], candidates: Sequence[Effect], settings: SearchSettings) -> tuple[str, ...]:
+def unobservable(logs: Sequence[WhitenedLog], candidates: Sequence[Effect]) -> tuple[str, ...]:
     """Unobservable parameters `effect.parameter`, or `effect` where all of them are.
 
     At its plausible size such a parameter adds fewer than `observable_squares` to the white residuals, given a constant bias.
     """
     out: list[str] = []
-    names = {effect.name for effect in candidates}
+    names, minimum = {effect.name for effect in candidates}, logs[0].pair.settings.search.observable_squares
     for effect in candidates:
         if not _proportional(effect) or effect.name in UNLISTED:
             continue
         gains = zip(effect.parameters, _gains(logs, effect), strict=True)
-        hidden = [parameter.name for parameter, gain in gains if gain < settings.observable_squares]
+        hidden = [parameter.name for parameter, gain in gains if gain < minimum]
         if len(hidden) == len(effect.parameters):
             out += [effect.name, *(name for name in NEEDS_DELAY.get(effect.name, ()) if name in names)]
         else:
@@ -117,7 +116,7 @@ def without_implausible(effect: Effect, theta: Theta, factor: float) -> Effect:
     return with_free(effect, free if any(not effect.parameters[k].begins for k in free) else []) if judged else effect
 
 
-def with_steady_clock(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect], starts: Starts) -> Fit:
+def with_steady_clock(base: Fit, named: Sequence[Effect], starts: Starts) -> Fit:
     """Fit with one or two of offset, skew and jump for a clock that wanders, if as good (BIC)."""
     others, best = tuple(entry for entry in base.chosen if entry[0].name != WANDER), base
     if len(others) == len(base.chosen):
@@ -127,13 +126,13 @@ def with_steady_clock(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Ef
         on_trend = len(some) > 1 and any(effect.name == "clock_skew" for effect in some)
         at = {"clock_offset": 0, "clock_skew": 0, "clock_jump": -1 if on_trend else 0}
         begun = (*others, *((effect, starts[effect.key][at[effect.name]]) for effect in some))
-        best = min(best, fit(logs, begun, near=base, give_up_above=bic(best) - parameter_cost(base, begun)), key=bic)
+        best = min(best, fit(base.logs, begun, near=base, give_up_above=bic(best) - parameter_cost(base, begun)), key=bic)
     return best
 
 
-def with_plainer_effects(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect]) -> Fit:
+def with_plainer_effects(base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with the plainer of two effects where the other is not clearly better (BIC)."""
-    poses = any(log.pair.band_hz is not None for log in logs)
+    poses = any(log.pair.band_hz is not None for log in base.logs)
     for complex_one, theta in base.chosen:
         sizes = _plainer(complex_one, theta, poses=poses)
         rest = tuple(entry for entry in base.chosen if entry[0] is not complex_one)
@@ -141,7 +140,7 @@ def with_plainer_effects(logs: Sequence[WhitenedLog], base: Fit, named: Sequence
         parts = [(with_free(e, sizes[e.name][0], complex_one.sensors), np.array(sizes[e.name][1])) for e in plainer]
         margin = base.logs[0].pair.settings.search.clearly_better * max(1.0, base.reduced_chi_square)
         limits = [bic(base) + margin - parameter_cost(base, (*rest, part)) for part in parts]
-        trials = [fit(logs, (*rest, part), near=base, give_up_above=at) for part, at in zip(parts, limits, strict=True)]
+        trials = [fit(base.logs, (*rest, part), near=base, give_up_above=at) for part, at in zip(parts, limits, strict=True)]
         best = min(trials, key=bic, default=base)
         base = best if bic(best) < bic(base) + margin else base
     return base
@@ -171,22 +170,17 @@ def _plainer(effect: Effect, theta: Theta, *, poses: bool) -> Mapping[str, tuple
     return {"gravity": (range(3), [g, 0.0, 0.0])} if name == "accel_scale" and len(theta) == 3 and abs(g) < SITES_M_S2 else {}
 
 
-def with_common_arm(
-    logs: Sequence[WhitenedLog],
-    base: Fit,
-    named: Sequence[Effect],
-    settings: SearchSettings,
-    is_significant: Callable[[Effect, float], bool],
-) -> Fit:
+def with_common_arm(base: Fit, named: Sequence[Effect], is_significant: Callable[[Effect, float], bool]) -> Fit:
     """Fit with a lever arm for a size effect of equal arms; with both if the rest is smaller."""
     arms = [k for k, (effect, _) in enumerate(base.chosen) if effect.name == "size_effect" and len(effect.parameters) == 9]
     lever = [effect for effect in named if effect.name == "lever_arm" and effect.key not in base.keys]
     if not arms or not lever:
         return base
+    logs, share = base.logs, base.logs[0].pair.settings.search.common_arm_share
     others, (size_effect, theta) = (*base.chosen[: arms[0]], *base.chosen[arms[0] + 1 :]), base.chosen[arms[0]]
     without = fit(logs, others, near=base)
     simple = fit(logs, (*others, (lever[0], lever[0].null_value.astype(float))), near=base)
-    if without.objective - simple.objective < settings.common_arm_share * (without.objective - base.objective):
+    if without.objective - simple.objective < share * (without.objective - base.objective):
         return base
     rest = with_free(size_effect, range(6))  # of the x and y axes against z, whose arm is the lever arm
     both = fit(logs, (*simple.chosen, (rest, rest.null_value.astype(float))), near=simple)
@@ -241,11 +235,11 @@ def may_act(effect: Effect, keys: Sequence[str]) -> bool:
     return (f"{effect.name}:{before}" if before else effect.name) in keys
 
 
-def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], settings: SearchSettings) -> bool:
+def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog]) -> bool:
     """Whether a fit is no answer: beyond the poses' band, too slow, too loud, or noise."""
     if any(n.minimum is not None and value < n.minimum for n, value in zip(effect.parameters, theta, strict=True)):
         return True
-    by_poses = [log.pair for log in logs if log.pair.band_hz is not None]
+    by_poses, settings = [log.pair for log in logs if log.pair.band_hz is not None], logs[0].pair.settings.search
     if effect.name == vibration.EFFECT.name and any(_is_motion(effect, theta, pair) for pair in by_poses):
         return True
     # smoothed poses lose and delay motion beyond their band by themselves, which looks alike

@@ -21,8 +21,8 @@ from scipy.stats import f as fisher
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, parameters_of, priors, sets_in, with_value
+from imutool.diagnosis.estimation.noise_estimate import axis_squares, white_rows
 from imutool.diagnosis.estimation.trial.walking_bias import squares_of_walk
-from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.units import AXES
 
 TAIL = 300.0  # half the gain, above which the tail itself underflows
@@ -131,10 +131,10 @@ class Scatter:
         return float(fisher.logsf(f, parameters, parameters * self.blocks[key]))
 
 
-def scatter(logs: Sequence[WhitenedLog], found: Fit, part: str, block_s: float) -> Scatter:
+def scatter(found: Fit) -> Scatter:
     """Robust covariance of a fit's free parameters, from blocks of the rows that were fitted."""
-    settings = logs[0].pair.settings.significance
-    blocks = [block for k, log in enumerate(logs) for block in _blocks(log, found, k, part, block_s)]
+    settings = found.logs[0].pair.settings.significance
+    blocks = [block for k in range(len(found.logs)) for block in _blocks(found, k)]
     _, prior_std = priors(found.chosen, found.settings)
     prior = np.diag(1.0 / np.where(_begins(found), FIXED_STD, prior_std) ** 2)
     lower = np.linalg.cholesky(sum((H for H, _ in blocks), start=prior))
@@ -150,28 +150,22 @@ def scatter(logs: Sequence[WhitenedLog], found: Fit, part: str, block_s: float) 
     outer = solve_triangular(lower, np.eye(len(lower)), lower=True)  # covariance by information: outer.T @ outer
     by_blocks, by_information = outer.T @ middle @ outer, outer.T @ outer
     out = _by_effect(found, by_blocks, by_information, [outer.T @ share @ outer for share in shares], settings.prior_blocks)
-    for key, diluted in _dilution(logs, found, part, by_information).items():
+    for key, diluted in _dilution(found, by_information).items():
         out.std[key] = np.hypot(out.std[key], diluted)
     return out
 
 
-def _dilution(
-    logs: Sequence[WhitenedLog], found: Fit, part: str, by_information: Matrix
-) -> dict[str, Float64[np.ndarray, " _"]]:
+def _dilution(found: Fit, by_information: Matrix) -> dict[str, Float64[np.ndarray, " _"]]:
     """Regression dilution of scale factors against poses, by effect: at most the squares left over the information.
 
     The error e of the expectation f + e is in the residual as well: E[(f + e) (-e)] = -E[e²], alike in every block of time
     (Fuller, Measurement Error Models, 1987, eq. 1.1.7).
     """
-    if all(log.pair.exact for log in logs):
+    if all(log.pair.exact for log in found.logs):
         return {}
-    squares = np.zeros(logs[0].pair.columns)
-    for k, log in enumerate(logs):
-        rows = log.rows(part)
-        squares += ((found.residuals[k][rows] - log.constants[rows] * found.bias[k]) ** 2).sum(axis=0)
-    out = {}
+    out, squares = {}, axis_squares(found)
     for effect, _ in found.chosen:
-        for signal, columns in logs[0].pair.signals.items():
+        for signal, columns in found.logs[0].pair.signals.items():
             if effect.name == SCALES.get(signal):
                 column = [columns.start + AXES.index(parameter.name) for parameter in effect.parameters if not parameter.begins]
                 out[effect.key] = np.where(sets_in(effect), 0.0, np.diag(by_information)[found.place(effect.key)])
@@ -220,10 +214,10 @@ def _seen_from(lower: Matrix, H: Matrix) -> Matrix:
     return np.asarray(0.5 * (out + out.T))
 
 
-def _blocks(log: WhitenedLog, found: Fit, k: int, part: str, block_s: float) -> list[tuple[Matrix, Float64[np.ndarray, " p"]]]:
-    """Information and score J^T r of each block, a constant taken out of the whole log."""
-    rows, begins = log.rows(part), _begins(found)
-    residual = found.residuals[k][rows] - log.constants[rows] * found.bias[k]
+def _blocks(found: Fit, k: int) -> list[tuple[Matrix, Float64[np.ndarray, " p"]]]:
+    """Information and score J^T r of each block of a log, a constant taken out of the whole log."""
+    log, begins, residual = found.logs[k], _begins(found), white_rows(found)[k]
+    rows, settings = log.rows(found.part), log.pair.settings
     J = np.zeros((log.pair.columns, len(begins), int(rows.sum())))
     for axis in range(log.pair.columns):
         where, J_axis = found.jacobians.on_axis(k, axis, rows)
@@ -231,7 +225,8 @@ def _blocks(log: WhitenedLog, found: Fit, k: int, part: str, block_s: float) -> 
         J[axis, where] = J_axis - np.outer(J_axis @ constant, constant) / max(float(constant @ constant), 1e-300)
     J[:, begins] = 0.0
     t_s = log.pair.stamp_s[:: log.whiten.every][rows]
-    block = np.floor((t_s - t_s[0]) / min(block_s, np.ptp(t_s) / log.pair.settings.significance.min_blocks)).astype(int)
+    block_s = min(settings.search.robust_block_s, np.ptp(t_s) / settings.significance.min_blocks)
+    block = np.floor((t_s - t_s[0]) / block_s).astype(int)
     out = []
     for number in np.unique(block):
         inside = block == number
@@ -243,14 +238,13 @@ def _blocks(log: WhitenedLog, found: Fit, k: int, part: str, block_s: float) -> 
 # ── onsets ──
 
 
-def estimate_onsets(
-    logs: Sequence[WhitenedLog], found: Fit, part: str, inflation: float
-) -> tuple[Fit, dict[tuple[str, int], float]]:
+def estimate_onsets(found: Fit) -> tuple[Fit, dict[tuple[str, int], float]]:
     """Fit with each onset at its posterior mean, and standard deviations (s).
 
     Nothing is smooth in an onset, so the times near it are searched. A time is as likely as exp(-squares / 2), the squares
-    divided by `inflation` where they are more than noise.
+    divided by the reduced chi-square where they are more than noise.
     """
+    logs, part, inflation = found.logs, found.part, max(1.0, found.reduced_chi_square)
     settings, period_s = logs[0].pair.settings.significance, max(log.pair.period_s for log in logs)
     spread: dict[tuple[str, int], float] = {}
     for k, (effect, theta) in enumerate(found.chosen):

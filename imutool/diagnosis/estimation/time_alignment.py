@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Float64
 from imutool.cleaning.stamp_line import unrounded
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair, split
 from imutool.diagnosis.estimation.timestamps import without_jitter
@@ -52,18 +52,12 @@ def with_simulation(
             expected="one motion, or true poses in both logs",
             fix="Leave `sim` out to compare the recording with its own true poses",
         )
-    start_ns = int(real.imu.t_ns[0])
-    stamp_s = seconds(real.imu.t_ns, start_ns)
-    found: list[tuple[Simulated, Bool[np.ndarray, " n"]]] = []
-    for part in _stretches(sim, settings):
-        t_sim = seconds(part.imu.t_ns, start_ns + nanoseconds(shift_s))  # on the recording's clock
-        simulated = _simulated(t_sim, part, shift_s, start_ns, real, settings, own_poses)
-        found.append((simulated, (stamp_s >= simulated[0].t_s[0]) & (stamp_s <= simulated[0].t_s[-1])))
-    shared_s = [_shared_s(stamp_s, inside) for _, inside in found]
+    found = [_simulated(part, shift_s, real, settings, own_poses) for part in _stretches(sim, settings)]
+    shared_s = [_shared_s(real, ideal) for ideal, _, _ in found]
     min_s = min(settings.alignment.min_s, max(shared_s))
     return [
-        replace(_pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise, None, settings), noise_left=remaining)
-        for ((ideal, noise, remaining), inside), shared in zip(found, shared_s, strict=True)
+        replace(_pair(real, ideal, "simulation", settings), aligned_s=shift_s, sim_noise=noise, noise_left=remaining)
+        for (ideal, noise, remaining), shared in zip(found, shared_s, strict=True)
         if shared >= min_s
     ]
 
@@ -83,35 +77,21 @@ def same_motion(real: Imu, sim: Imu, settings: AlignmentSettings = DEFAULT.align
     return _shift(real, sim, settings) is not None
 
 
-def with_truth(
-    real: Recording, ideal: IdealMotion, start_ns: int, band_hz: float, settings: DiagnoseSettings = DEFAULT
-) -> Pair:
+def with_truth(real: Recording, ideal: IdealMotion, band_hz: float, settings: DiagnoseSettings = DEFAULT) -> Pair:
     """Align a recording with the motion of its own true poses.
 
-    `ideal` counts seconds from `start_ns` and is true up to `band_hz`.
+    `ideal` counts seconds from its first sample and is true up to `band_hz`.
 
     Raises:
         DataError: too little shared time.
     """
-    stamp_s = seconds(real.imu.t_ns, start_ns)
-    inside = (stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1])
+    start_ns = int(real.imu.t_ns[0])
     ideal = replace(ideal, channels=_channels(real, start_ns + np.round(ideal.t_s * 1e9).astype(np.int64)))
-    return _pair(real, ideal, stamp_s, inside, "true poses", 0.0, np.zeros(6), band_hz, settings)
+    return replace(_pair(real, ideal, "true poses", settings), band_hz=band_hz)
 
 
-def _pair(
-    real: Recording,
-    ideal: IdealMotion,
-    stamp_s: Float64[np.ndarray, " n"],
-    inside: Bool[np.ndarray, " n"],
-    against: str,
-    aligned_s: float,
-    sim_noise: Float64[np.ndarray, "6"],
-    band_hz: float | None,
-    settings: DiagnoseSettings,
-) -> Pair:
-    rows, shared_s = np.flatnonzero(inside), _shared_s(stamp_s, inside)
-    min_s = settings.alignment.min_s
+def _pair(real: Recording, ideal: IdealMotion, against: str, settings: DiagnoseSettings) -> Pair:
+    shared_s, min_s = _shared_s(real, ideal), settings.alignment.min_s
     if shared_s < min_s:
         raise DataError(
             f"{shared_s:.1f} s shared with the {against}",
@@ -119,8 +99,7 @@ def _pair(
             expected=f"at least {min_s:g} s",
             fix="Give logs of the same time, or a longer one",
         )
-    part = slice(int(rows[0]), int(rows[-1]) + 1)
-    stamp_s = stamp_s[part]
+    stamp_s, part = _inside(real, ideal)
     samples = np.concatenate([real.imu.gyro.T, real.imu.accel.T])[:, part].T
     # a column in one piece of memory, with which effects, filters and splines take two thirds of the time
     gyro, accel, alpha = (np.asfortranarray(x) for x in (ideal.gyro, ideal.accel, ideal.alpha))
@@ -139,17 +118,23 @@ def _pair(
         ideal=replace(ideal, gyro=gyro, accel=accel, alpha=alpha),
         truth=truth,
         poses_hz=1.0 / real.truth.period_s if truth is not None else 0.0,
-        aligned_s=aligned_s,
-        band_hz=band_hz,
         start_ns=int(t_ns[0]),
-        sim_noise=sim_noise,
         settings=settings,
         channels={name: values for name, values in _channels(real, t_ns).items() if np.ptp(values) > 0},
     )
 
 
-def _shared_s(stamp_s: Float64[np.ndarray, " n"], inside: Bool[np.ndarray, " n"]) -> float:
-    return float(np.ptp(stamp_s[inside])) if inside.any() else 0.0
+def _inside(real: Recording, ideal: IdealMotion) -> tuple[Float64[np.ndarray, " n"], slice]:
+    """Samples of a recording within a motion: their stamps and rows."""
+    stamp_s = seconds(real.imu.t_ns, int(real.imu.t_ns[0]))
+    rows = np.flatnonzero((stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1]))
+    part = slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0)
+    return stamp_s[part], part
+
+
+def _shared_s(real: Recording, ideal: IdealMotion) -> float:
+    stamp_s, _ = _inside(real, ideal)
+    return float(np.ptp(stamp_s)) if len(stamp_s) else 0.0
 
 
 def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.ndarray, " n"]]:
@@ -157,16 +142,10 @@ def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.nd
     return channels_at(recording, seconds(t_ns, int(t_ns[0])), int(t_ns[0]), min_messages=2)
 
 
-def _simulated(
-    t_sim: Float64[np.ndarray, " m"],
-    sim: Recording,
-    shift_s: float,
-    start_ns: int,
-    real: Recording,
-    settings: DiagnoseSettings,
-    own_poses: bool,
-) -> Simulated:
+def _simulated(sim: Recording, shift_s: float, real: Recording, settings: DiagnoseSettings, own_poses: bool) -> Simulated:
     """Simulated motion without noise on an even clock, the noise that was filtered out, and what is left of it."""
+    start_ns = int(real.imu.t_ns[0])
+    t_sim = seconds(sim.imu.t_ns, start_ns + nanoseconds(shift_s))  # on the recording's clock
     samples = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1)
     noise = white_noise(samples)
     t_sim = without_jitter(t_sim, samples, settings.timestamps)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
@@ -23,7 +23,7 @@ MIN_VALUES, MIN_ROWS = 3, 100  # of a grid
 OWN_LIMIT = 0.1  # of the largest reading of a sensor, that the limit of one axis is at least
 READ, NOISY = 0.999, 6.0  # of the readings are no glitch; deviations of a sample by which noise goes beyond a limit
 FINER = 0.05  # of the noise, that readings differ by right below a limit
-UNEVEN = "stamps jitter, samples do not"
+JITTER, UNEVEN = "timestamp_jitter", "stamps jitter, samples do not"
 
 
 def even(
@@ -40,22 +40,22 @@ def even(
     missing = np.concatenate([[0.0], np.cumsum(periods - 1.0)])
     if (np.abs(steps / np.median(steps) - periods) > settings.clear_share).any():
         period, phase, agree = _period(since, settings)
-        if agree < settings.min_agreement:
-            return _by_level(stamp_s, k, settings)
-        counted = np.rint((since - phase) / period) - k
-        steady = median_filter(counted, settings.median_samples, mode="nearest")
+        missing = counted = np.rint((since - phase) / period) - k
         # a stamp well within its own period is taken at its word
         clear = np.abs((since - phase) / period - k - counted) < settings.clear_share
-        missing = np.where(clear, counted, steady)
-        missing = np.where(np.abs(missing - steady) > 0.5, steady, missing) if not clear.all() else counted
+        if agree < settings.min_agreement:
+            missing = _by_level(stamp_s, k, settings)
+        elif not clear.all():
+            steady = median_filter(counted, settings.median_samples, mode="nearest")
+            missing = np.where(clear & (np.abs(counted - steady) <= 0.5), counted, steady)
     slope, start = np.polyfit(k + missing, stamp_s, 1)
     return start + slope * (k + missing), int(missing[-1] - missing[0])
 
 
 def _by_level(
     stamp_s: Float64[np.ndarray, " n"], k: Float64[np.ndarray, " n"], settings: TimestampSettings
-) -> tuple[Float64[np.ndarray, " n"], int]:
-    """Even stamps under large jitter: a missing sample lifts the level of all later ones."""
+) -> Float64[np.ndarray, " n"]:
+    """Samples that are missing before each, under large jitter: one that is missing lifts the level of all later ones."""
     lag = settings.lag_samples
     period = float(np.median(stamp_s[lag:] - stamp_s[:-lag])) / lag
     missing = np.zeros(len(stamp_s))
@@ -64,8 +64,7 @@ def _by_level(
         period = slope if missing.any() or abs(slope / period - 1.0) < 0.1 / len(k) else period
         level = median_filter((stamp_s - start) / period - k, settings.median_samples, mode="nearest")
         missing = np.maximum.accumulate(np.rint(level - level[0]))
-    slope, start = np.polyfit(k + missing, stamp_s, 1)
-    return start + slope * (k + missing), int(missing[-1] - missing[0])
+    return missing
 
 
 def _period(since_s: Float64[np.ndarray, " n"], settings: TimestampSettings) -> tuple[float, float, float]:
@@ -96,27 +95,39 @@ def jitter(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
 
     unsure = float(np.mean([x.std() / np.sqrt(len(x)) for _, x in corrections]))  # of the even clock's start
     share = (Parameter("share", "-", 1.0), Parameter("begins_off", "s", unsure), Parameter("ends_off", "s", 2.0 * unsure))
-    return (Effect("timestamp_jitter", Stage.CLOCK, SENSORS, UNEVEN, share, "it moves, and stamps are uneven", forward),)
+    return (Effect(JITTER, Stage.CLOCK, SENSORS, UNEVEN, share, "it moves, and stamps are uneven", forward),)
+
+
+def by_samples(
+    pairs: Sequence[Pair], name: str, signal: str, parameters: Mapping[str, Estimate], equation: str, p_value: float = 0.0
+) -> Finding:
+    """Finding that samples and stamps show by themselves, without a fit."""
+    length_s = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
+    return Finding(name, signal, 0.0, p_value, p_value, parameters, equation, HeldOut(0.0, 0.0, "-", round(length_s, 1)))
+
+
+def uneven(pairs: Sequence[Pair], std_s: float, equation: str, p_value: float = 0.0) -> Finding:
+    """Finding of stamps that are off by so much."""
+    count = sum(len(pair.stamp_s) for pair in pairs)
+    parameters = {"std": Estimate(std_s, float(std_s / np.sqrt(2.0 * count)), "s")}
+    return by_samples(pairs, JITTER, "both", parameters, equation, p_value)
 
 
 def dropped(pairs: Sequence[Pair]) -> list[Finding]:
     """Finding of dropped samples that an even clock would have had."""
-    settings, missing, total, length = pairs[0].settings.timestamps, 0, 0, 0.0
-    for pair in pairs:
-        missing, total = missing + even(pair.stamp_s, settings)[1], total + len(pair.stamp_s)
-        length += float(pair.stamp_s[-1] - pair.stamp_s[0])
+    settings, total = pairs[0].settings.timestamps, sum(len(pair.stamp_s) for pair in pairs)
+    missing = sum(even(pair.stamp_s, settings)[1] for pair in pairs)
     if missing < settings.min_missing:
         return []
     share = Estimate(missing / (missing + total), float(np.sqrt(missing)) / (missing + total), "-")
     parameters = {"share": share, "missing": Estimate(float(missing), 0.0, "samples")}
-    held_out = HeldOut(0.0, 0.0, "-", round(length, 1))
-    return [Finding("dropped_samples", "both", 0.0, 0.0, 0.0, parameters, "samples are missing", held_out)]
+    return [by_samples(pairs, "dropped_samples", "both", parameters, "samples are missing")]
 
 
 def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Finding]:
     """Finding of quantization: values on a grid as coarse as the noise."""
     settings, lsb = pairs[0].settings.timestamps, {}
-    for k, signal in enumerate(("gyro", "accel")):
+    for k, signal in enumerate(SENSORS):
         axes = [pair.real[:, a] for pair in pairs for a in range(3 * k, 3 * k + 3)]
         grids = [grid(x, settings) for x in axes if len(np.unique(x)) >= MIN_VALUES] or [0.0]  # fewer lie on any grid
         noise = float(np.sqrt(np.mean(floor[3 * k : 3 * k + 3] ** 2)))
@@ -124,10 +135,9 @@ def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Find
             lsb[signal] = float(np.median(grids))
     if not lsb:
         return []
-    signal = next(iter(lsb)) if len(lsb) == 1 else "both"
+    of = "both" if len(lsb) > 1 else next(iter(lsb))
     parameters = {f"{name}_lsb": Estimate(value, 1e-3 * value, UNITS[name]) for name, value in lsb.items()}
-    held_out = HeldOut(0.0, 0.0, "-", round(sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs), 1))
-    return [Finding("quantization", signal, 0.0, 0.0, 0.0, parameters, "values are multiples of an LSB", held_out)]
+    return [by_samples(pairs, "quantization", of, parameters, "values are multiples of an LSB")]
 
 
 def grid(x: Float64[np.ndarray, " n"], settings: TimestampSettings = DEFAULT.timestamps) -> float:
@@ -136,8 +146,6 @@ def grid(x: Float64[np.ndarray, " n"], settings: TimestampSettings = DEFAULT.tim
     if len(values) < MIN_VALUES:
         return 0.0
     step = float(np.diff(values).min())
-    if step <= 0:
-        return 0.0
     for _ in range(3):  # least squares on the multiples
         k = np.rint((values - values[0]) / step)
         step = float((k @ (values - values[0])) / (k @ k))
@@ -243,12 +251,7 @@ def late_stamps(pairs: Sequence[Pair]) -> list[Finding]:
     chance = _chance_of_following(logs, settings)
     if chance == 1.0:
         return []
-    all_s = np.concatenate(lateness)
-    std = float(all_s.std())
-    length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
-    parameters = {"std": Estimate(std, float(std / np.sqrt(2.0 * len(all_s))), "s")}
-    held_out = HeldOut(0.0, 0.0, "-", round(length, 1))
-    return [Finding("timestamp_jitter", "both", 0.0, chance, chance, parameters, UNEVEN, held_out)]
+    return [uneven(pairs, float(np.concatenate(lateness).std()), UNEVEN, chance)]
 
 
 def without_jitter(

@@ -19,7 +19,7 @@ from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import AddedColumns, Chosen, SplineBasis, SplineCurve, expected
 from imutool.diagnosis.estimation.observability import values_of, without_implausible
 from imutool.diagnosis.estimation.significance import bic
-from imutool.diagnosis.estimation.trial.lag_start import is_late
+from imutool.diagnosis.estimation.trial.filter_forms import is_late
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
@@ -199,13 +199,13 @@ def like(pairs: Sequence[Pair]) -> SensorSamples:
     return pair.ideal.sample(stamp_s, stamp_s)
 
 
-def with_finer_curve(logs: Sequence[WhitenedLog], base: Fit) -> Fit:
+def with_finer_curve(base: Fit) -> Fit:
     """Fit with more knots in the curve that has just come in, where an edge pays for them (BIC)."""
     others, (effect, _) = base.chosen[:-1], base.chosen[-1]
-    fine = finer_curve(logs, effect) if isinstance(effect.forward, Curve) else None
+    fine = finer_curve(base.logs, effect) if isinstance(effect.forward, Curve) else None
     if fine is None:
         return base
-    trial = fit(logs, (*others, (fine, fine.null_value.astype(float))), near=base)
+    trial = fit(base.logs, (*others, (fine, fine.null_value.astype(float))), near=base)
     return trial if bic(trial) < bic(base) - base.logs[0].pair.settings.search.clearly_better else base
 
 

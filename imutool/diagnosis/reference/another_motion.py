@@ -131,6 +131,5 @@ def _is_comparable(effect: Effect, logs: Sequence[WhitenedLog]) -> bool:
 
 def _numbers(found: Fit) -> tuple[dict[str, Theta], dict[str, Theta]]:
     """Parameters and robust deviations by effect."""
-    block_s = found.logs[0].pair.settings.search.robust_block_s
-    std = scatter(found.logs, found, found.part, block_s).std if found.chosen else {}
+    std = scatter(found).std if found.chosen else {}
     return {e.key: theta for e, theta in found.chosen}, {key: np.asarray(value) for key, value in std.items()}

@@ -23,8 +23,8 @@ from imutool.diagnosis.reference.taken_samples import (
     repeats,
     without_common_jitter,
 )
-from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut, Located
-from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings, ReferenceSettings
+from imutool.diagnosis.result import Diagnosis, Estimate, Finding, Located
+from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.diagnosis.wording.quantity import percent
 from imutool.errors import DataError, ImutoolError, NumericsError
 from imutool.inertial.stationary import white_noise
@@ -64,7 +64,7 @@ def align_all(
                 raise
             refused.append(error.at(recording.name))
             continue
-        pairs += [without_unusable(pair, settings.reference) for pair in aligned]
+        pairs += map(without_unusable, aligned)
         remarks += [remark] if remark else []
         remarks += _held(recording, "the topic is faster than its sensor")
         remarks += batch_remark(recording)
@@ -211,12 +211,13 @@ def own_poses_sentence(pairs: Sequence[Pair]) -> str:
     )
 
 
-def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
+def without_unusable(pair: Pair) -> Pair:
     """Pair without clipped, repeated and filled samples, and axes stuck or mostly clipped.
 
     Raises:
         DataError: no axis is left.
     """
+    min_s = pair.settings.reference.min_known_s
     whole_rows = (repeats(pair.real) | filled(pair.stamp_s, pair.real))[:, None]
     known = ~(timestamps.clipped(pair.real, pair.settings.timestamps) | timestamps.stuck(pair.real) | whole_rows)
     known &= True if pair.known is None else pair.known
@@ -224,12 +225,12 @@ def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
         return pair
     reduced = replace(pair, known=known)
     for part in (pair.fitted, pair.held_out):
-        known &= (known[part].sum(axis=0) * pair.period_s >= settings.min_known_s) | (known[part].all(axis=0))
+        known &= (known[part].sum(axis=0) * pair.period_s >= min_s) | (known[part].all(axis=0))
     if not known.any():
         raise DataError(
             "; ".join(unusable_axes(reduced)),
             where=pair.name,
-            expected=f"{settings.min_known_s:g} s or more of an axis that moves within its range",
+            expected=f"{min_s:g} s or more of an axis that moves within its range",
             fix="Record with a sensor that works, of a wider range or of finer digits",
         )
     return reduced
@@ -262,8 +263,7 @@ def _limits(pair: Pair) -> list[Finding]:
     parameters = {name: Estimate(value, 0.0, UNITS[signal]) for name, signal, value in found}
     signals = {signal for _, signal, _ in found}
     signal = signals.pop() if len(signals) == 1 else "both"
-    held_out = HeldOut(0.0, 0.0, "-", round(float(pair.stamp_s[-1] - pair.stamp_s[0]), 1))
-    return [Finding("saturation", signal, 0.0, 0.0, 0.0, parameters, "readings pile up at +-limit", held_out)]
+    return [timestamps.by_samples([pair], "saturation", signal, parameters, "readings pile up at +-limit")]
 
 
 def locate_stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) -> Iterator[Located]:

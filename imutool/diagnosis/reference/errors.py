@@ -28,6 +28,7 @@ from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located
 from imutool.diagnosis.settings import ReferenceSettings
 from imutool.recording import Recording
+from imutool.recording.columns import true_ranges
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import IdealMotion
@@ -40,11 +41,12 @@ Matrix = Float64[np.ndarray, "3 3"]
 Vector = Float64[np.ndarray, "3"]
 
 
-def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -> tuple[list[Finding], tuple[Located, ...]]:
+def reference_errors(logs: Sequence[WhitenedImu]) -> tuple[list[Finding], tuple[Located, ...]]:
     """Intervals of a wrong reference, as a finding and locations; of shocks their locations."""
     if len(logs) != 1:
         return [], ()
-    (log,), block_s, p_value = logs, settings.block_s, settings.p_value
+    (log,), settings = logs, logs[0].pair.settings.reference
+    block_s, p_value = settings.block_s, settings.p_value
     rows = log.rows("all")
     if not rows.any():
         return [], ()
@@ -71,8 +73,11 @@ def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -
     excess = (white[inside] ** 2).sum() - 6.0 * inside.sum()
     share = float(np.clip(excess / max(float((white**2).sum() - 6.0 * len(white)), 1e-300), 0.0, 1.0))
     shock = _is_shock(log, runs)
+    own = "no regime: shocks of the recording" if shock else "no regime: the reference's own moments"
     places = tuple(
-        _where(signal, white[:, 3 * k : 3 * k + 3], inside, runs, share, p_value, shock) for k, signal in enumerate(SENSORS)
+        Located(signal, axes or AXES, tuple(runs), own, share, p_value, extent="intermittent")
+        for signal, squares in zip(SENSORS, (white[inside] ** 2).mean(axis=0).reshape(2, 3), strict=True)
+        for axes in [tuple(axis for axis, value in zip(AXES, squares, strict=True) if value > 1.3)]
     )
     if shock:
         return [], places
@@ -108,26 +113,11 @@ def _is_shock(log: WhitenedImu, runs: Sequence[tuple[float, float]]) -> bool:
     return all(shaken[part].sum() > FAST_SHARE * missed[part].sum() for part in pair.signals.values())
 
 
-def _where(
-    signal: str,
-    white: Float64[np.ndarray, "n 3"],
-    inside: np.ndarray,
-    runs: list[tuple[float, float]],
-    share: float,
-    p_value: float,
-    shock: bool,
-) -> Located:
-    axes = tuple(axis for axis, value in zip(AXES, (white[inside] ** 2).mean(axis=0), strict=True) if value > 1.3)
-    own = "shocks of the recording" if shock else "the reference's own moments"
-    return Located(signal, axes or AXES, tuple(runs), f"no regime: {own}", share, p_value, extent="intermittent")
-
-
 def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list[tuple[float, float]]:
     """Stretches of loud blocks (s), those close to one another joined."""
-    edges = np.diff(np.concatenate([[0], loud.astype(int), [0]]))
     out: list[tuple[float, float]] = []
-    for first, last in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
-        begin, end = start_s + float(first) * settings.block_s, start_s + float(last) * settings.block_s
+    for first, last in true_ranges(loud):
+        begin, end = start_s + first * settings.block_s, start_s + last * settings.block_s
         if out and begin - out[-1][1] < settings.join_s:
             out[-1] = out[-1][0], end
         else:
@@ -178,7 +168,7 @@ SMOOTHED = Effect(
 # ── an attitude that is turned throughout ──
 
 
-def turned_reference(logs: Sequence[WhitenedImu], chosen: Chosen, settings: ReferenceSettings) -> list[Finding]:
+def turned_reference(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Finding]:
     """Finding of poses whose attitude is turned by a constant rotation; none for another misfit.
 
     Means over seconds of the gyro's residual are r = b + turned x omega, those of the accelerometer b + turned x f; the two
@@ -186,7 +176,8 @@ def turned_reference(logs: Sequence[WhitenedImu], chosen: Chosen, settings: Refe
     """
     if any(log.pair.exact or log.pair.ideal.R_wb is None for log in logs) or len({log.pair.name for log in logs}) > 1:
         return []
-    means = [_slow_means(log, chosen, settings.turned_block_s) for log in logs]
+    settings = logs[0].pair.settings.reference
+    means = [_slow_means(log, chosen) for log in logs]
     residual, signal = (np.concatenate([part[k] for part in means]) for k in (0, 1))
     if len(residual) < settings.min_turned_blocks:
         return []
@@ -212,12 +203,10 @@ def turned_reference(logs: Sequence[WhitenedImu], chosen: Chosen, settings: Refe
     return [Finding("reference_error", "both", share, p_value, p_value, parameters, "R_ref = R_wb Exp(turned)", held_out)]
 
 
-def _slow_means(
-    log: WhitenedImu, chosen: Chosen, block_s: float
-) -> tuple[Float64[np.ndarray, "b 6"], Float64[np.ndarray, "b 6"]]:
+def _slow_means(log: WhitenedImu, chosen: Chosen) -> tuple[Float64[np.ndarray, "b 6"], Float64[np.ndarray, "b 6"]]:
     """Means of the residual and of the expected samples over blocks that are usable throughout."""
     pair, model = log.pair, expected(log.pair, chosen)
-    count = round(block_s / pair.period_s)
+    count = round(pair.settings.reference.turned_block_s / pair.period_s)
     blocks = len(model) // count
     usable = np.asarray(pair.usable.all(axis=1), dtype=float)[: blocks * count]
     used = np.flatnonzero(usable.reshape(blocks, count).mean(axis=1) > MOSTLY)

@@ -97,7 +97,7 @@ def _pairs(real: Recording, motion: SmoothMotion, settings: DiagnoseSettings) ->
         middle_s = (ideal.t_s[0] + ideal.t_s[-1]) / 2.0
         stretch = next(part for part in motion.stretches if part.start_s <= middle_s <= part.end_s)
         since = _with_lost_motion(since, stretch.cutoff_hz, settings.reference.band_share)
-        pair = with_truth(real, since, started_ns, band_hz(stretch, settings.reference), settings)
+        pair = with_truth(real, since, band_hz(stretch, settings.reference), settings)
         of_gyro = np.tile(np.arange(6) < 3, (len(pair.stamp_s), 1))  # without positions nothing is known of the accelerometer
         yield pair if real.truth.has_positions else replace(pair, known=of_gyro)
 

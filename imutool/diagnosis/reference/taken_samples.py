@@ -10,8 +10,8 @@ import numpy as np
 from imutool.array_types import Bool, Float64
 from imutool.cleaning.stamp_line import batch_words, read_stamps, restamped
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.timestamps import even
-from imutool.diagnosis.result import Estimate, Finding, HeldOut
+from imutool.diagnosis.estimation.timestamps import JITTER, even, uneven
+from imutool.diagnosis.result import Finding
 from imutool.diagnosis.settings import TimestampSettings
 from imutool.inertial.stationary import white_noise
 from imutool.recording import Recording, seconds
@@ -23,7 +23,6 @@ MIN_NEW = 0.05  # of the samples with news of both sensors: two that take turns 
 STRAIGHT = 1e-3  # of the median change of the slope, up to which three samples are on a line: float32 rounds far less
 STUCK = 10  # samples in a row that a sensor stands still, and is not held
 MOSTLY_COMMON, OWN_NOISE = 0.5, 0.1  # of the stamps of a simulation; of the noise, that two logs of one sample differ by
-JITTER = "timestamp_jitter"
 
 
 def new_samples(recording: Recording) -> Recording:
@@ -112,11 +111,7 @@ def batched(pairs: Sequence[Pair], others: Sequence[Finding]) -> list[Finding]:
     late_s = max(pair.batched_s for pair in pairs)
     if not late_s or any(finding.effect == JITTER for finding in others):
         return []
-    count = sum(len(pair.stamp_s) for pair in pairs)
-    length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
-    parameters = {"std": Estimate(late_s, late_s / np.sqrt(2.0 * count), "s")}
-    held_out = HeldOut(0.0, 0.0, "-", round(length, 1))
-    return [Finding(JITTER, "both", 0.0, 0.0, 0.0, parameters, "stamps come in batches, samples do not", held_out)]
+    return [uneven(pairs, late_s, "stamps come in batches, samples do not")]
 
 
 def batch_remark(recording: Recording) -> list[str]:

@@ -49,9 +49,9 @@ class AlignedSignal(AlignedLog):
     names: tuple[str, ...]
     units: tuple[str, ...]
     kind: str
-    lag_s: float
     sim_density: Float64[np.ndarray, " k"]
-    shares_epoch: bool
+    lag_s: float = 0.0
+    shares_epoch: bool = True
     clock_std_s: float = 0.0
     constants: tuple[float, ...] = ()
 
@@ -120,6 +120,7 @@ class AlignedSignal(AlignedLog):
         known = self.stamp_s - self.ideal.start_s > length_s
         return replace(self, fitted=self.fitted & known, held_out=self.held_out & known)
 
+    @cached_property
     def scale(self) -> Scale:
         """Sizes from which effects take their plausible parameters."""
         sampled, relation = self.sampled, self.ideal.relation
@@ -156,7 +157,7 @@ def aligned(pair: SignalPair, others: Mapping[str, Fields], settings: DiagnoseSe
         t_real = seconds(pair.real_ns, start_ns)
         rows = np.flatnonzero((t_real > ideal.start_s + ENDS_S) & (t_real < end_s - ENDS_S))
         band = band_hz(pair.state, ideal.rate_hz, settings.signal) if isinstance(ideal.relation, Dynamics) else None
-        return _aligned(pair, ideal, rows, t_real, density, settings, band_hz=band)
+        return replace(_aligned(pair, ideal, rows, density, settings), band_hz=band)
     t_real, t_sim = seconds(pair.real_ns, start_ns), seconds(pair.sim_ns, start_ns)
     lag_s, aligned_s = 0.0, pair.clock_s or None
     if pair.clock_s is None:
@@ -169,17 +170,9 @@ def aligned(pair: SignalPair, others: Mapping[str, Fields], settings: DiagnoseSe
     rate_hz = settings.signal.oversampling / min(period_sim, period_real)
     ideal, density = from_simulation(t_sim, pair.sim, period_sim, rate_hz, settings)
     ideal = replace(ideal, channels=channels, state=state_on(ideal, pair.state, start_ns))
-    signal = _aligned(
-        pair,
-        ideal,
-        rows,
-        t_real,
-        density,
-        settings,
-        lag_s=lag_s,
-        aligned_s=0.0 if aligned_s is None else aligned_s,
-        shares_epoch=aligned_s is None,
-    )
+    signal = replace(_aligned(pair, ideal, rows, density, settings), lag_s=lag_s)
+    if aligned_s is not None:
+        signal = replace(signal, aligned_s=aligned_s, shares_epoch=False)
     step, usable = np.diff(t_sim), np.ones(len(signal.stamp_s), bool)
     for gap in np.flatnonzero(step > max(settings.split.gap_periods * period_sim, 0.1)):  # what was never simulated
         usable &= (signal.stamp_s < t_sim[gap] + early - settings.split.margin_s) | (
@@ -192,20 +185,15 @@ def _aligned(
     pair: SignalPair,
     ideal: IdealSignal,
     rows: Int64[np.ndarray, " r"],
-    t_real: Column,
     density: Float64[np.ndarray, " k"],
     settings: DiagnoseSettings,
-    *,
-    lag_s: float = 0.0,
-    aligned_s: float = 0.0,
-    shares_epoch: bool = True,
-    band_hz: float | None = None,
 ) -> AlignedSignal:
-    """Recorded rows with their ideal signal.
+    """Recorded rows with their ideal signal, of one clock.
 
     Raises:
         DataError: too few rows.
     """
+    t_real = seconds(pair.real_ns, int(pair.real_ns[0]))
     _refuse_little(t_real[rows], pair.name, settings.signal)
     part = slice(int(rows[0]), int(rows[-1]) + 1)
     held_out, usable = split(t_real[part], settings.split)
@@ -215,17 +203,13 @@ def _aligned(
         pair.real[part],
         usable & ~held_out,
         usable & held_out,
-        aligned_s=aligned_s,
-        band_hz=band_hz,
         start_ns=int(pair.real_ns[0]),
         ideal=ideal,
         names=pair.names,
         units=pair.units,
         kind=pair.kind,
-        lag_s=lag_s,
         sim_density=density,
         noise_left=NoiseLeft(np.array([0.0, 0.5 / float(np.median(np.diff(t_real)))]), np.stack([density] * 2)),
-        shares_epoch=shares_epoch,
         clock_std_s=pair.clock_std_s,
         settings=settings,
     )

@@ -128,7 +128,7 @@ def above_model_error(log: WhitenedLog, selection: Selection) -> tuple[Selection
     pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     if not selection.selected:
         return selection, []
-    size, of = np.array(pair.scale().size), _changes if pair.band_hz is None else _sizes
+    size, of = np.array(pair.scale.size), _changes if pair.band_hz is None else _sizes
     sizes = np.stack([of(log, selection, selected) for selected in selection.selected])
     of_size, of_largest = INTERPOLATION_ERROR, pair.settings.search.model_error
     if pair.band_hz is not None:

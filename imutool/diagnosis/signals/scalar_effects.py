@@ -7,9 +7,8 @@ lag are those of control textbooks (e.g. Slotine and Li, Applied Nonlinear Contr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -18,9 +17,10 @@ from imutool.array_types import Float64
 from imutool.diagnosis.estimation.jacobians import SplineCurve
 from imutool.diagnosis.estimation.unnamed_effects import LAGS_S
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal
-from imutool.sensor.effect import Effect, Kind, Parameter, Stage, Theta
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.effects.low_pass import Design, smoothed
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, SignalSamples
+from imutool.sensor.robot_effects.signal_sizes import Scale, late
 from imutool.units import AXES
 
 CUTOFFS = (100.0, 30.0, 10.0, 3.0, 1.0, 0.3)  # to start from, over the signal's own mean frequency
@@ -35,45 +35,22 @@ KNOTS, KNOTS_OF_TIME = 7, 15
 BEND = 0.3  # of the signal's size: a second difference between a curve's knots
 
 
-def _effect(
-    name: str,
-    stage: Stage,
-    equation: str,
-    parameters: tuple[Parameter, ...],
-    forward: Callable[..., Any],
-    starts: Sequence[Theta] | None = None,
-    **more: Any,
-) -> Effect:
-    """An effect on the one column; nonlinear, unless it has no starts."""
-    given = None if starts is None else lambda ideal, real: starts
-    return Effect(name, stage, (), equation, parameters, "it varies", forward, starts is None, given, **more)
-
-
 # ── the effects ──
 
 
 def offset(signal: AlignedSignal, k: int) -> Effect:
     """A constant of one column: part of every fit."""
     numbers = (Parameter("offset", signal.units[k], 10.0 * float(np.ptp(signal.real[:, k]))),)
-    return replace(
-        _effect("offset", Stage.SENSOR, "y += offset", numbers, lambda s, theta: s.with_added(k, theta[0]), [np.zeros(1)]),
-        variant=signal.names[k] if signal.columns > 1 else "",
-        sensors=(signal.names[k],) if signal.columns > 1 else (),
-    )
+    starts, effect = [np.zeros(1)], signal.scale.effect
+    return effect("offset", (k,), "y += offset", numbers, lambda s, theta: s.with_added(k, theta[0]), starts=starts)
 
 
-def delay(lag_s: float, step_s: float) -> Effect:
-    """A delay, positive where the recording comes late; `step_s` is the step of its derivative."""
+def delay(signal: AlignedSignal, name: str, std_s: float, lag_s: float = 0.0) -> Effect:
+    """A delay, positive where the recording comes late; at first sight it is `lag_s`."""
     starts = [np.zeros(1)] if abs(lag_s) < 1e-9 else [np.zeros(1), np.array([lag_s])]
-    numbers = (Parameter("delay", "s", max(0.2, abs(lag_s)), step=step_s),)
-    return _effect("delay", Stage.CLOCK, "y(t) = x(t - delay)", numbers, lambda taken_s, theta: taken_s - theta[0], starts)
-
-
-def clock(std_s: float, step_s: float) -> Effect:
-    """A difference of the clocks within its deviation, which is no finding."""
-    numbers = (Parameter("delay", "s", std_s, step=step_s),)
-    text = "y(t) = x(t - delay)"
-    return _effect("clock", Stage.CLOCK, text, numbers, lambda taken_s, theta: taken_s - theta[0], [np.zeros(1)])
+    numbers = (Parameter("delay", "s", std_s, step=delay_step_s(signal)),)
+    text, columns = "y(t) = x(t - delay)", signal.scale.columns
+    return signal.scale.effect(name, columns, text, numbers, late, stage=Stage.CLOCK, starts=starts)
 
 
 def delay_step_s(signal: AlignedSignal) -> float:
@@ -83,25 +60,20 @@ def delay_step_s(signal: AlignedSignal) -> float:
 
 def named(signal: AlignedSignal) -> Iterator[Effect]:
     """The catalogue of effects that any signal can have."""
-    unit, size, slope = signal.units[0], float(signal.sampled.x.std()), float(signal.sampled.dx.std())
-    yield delay(signal.lag_s, delay_step_s(signal))
-    yield _effect(
-        "low_pass",
-        Stage.BANDWIDTH,
-        "dy/dt = 2 pi f_c (x - y)",
-        (Parameter("f_c", "Hz", 10.0, positive=True, null_value=np.inf, step=LOG_MOVED),),
-        _low_pass,
-        [np.array([rate / (2.0 * np.pi)]) for rate in (*np.multiply(CUTOFFS, slope / size), *_of_lag(signal.lag_s))],
-        lagless=_lagless,
-    )
+    scale, unit, size, slope = signal.scale, signal.units[0], float(signal.sampled.x.std()), float(signal.sampled.dx.std())
+    yield delay(signal, "delay", max(0.2, abs(signal.lag_s)), signal.lag_s)
+    cutoff = (Parameter("f_c", "Hz", 10.0, positive=True, null_value=np.inf, step=LOG_MOVED),)
+    rates = (*np.multiply(CUTOFFS, slope / size), *_of_lag(signal.lag_s))
+    starts, text = [np.array([rate / (2.0 * np.pi)]) for rate in rates], "dy/dt = 2 pi f_c (x - y)"
+    yield scale.effect("low_pass", (0,), text, cutoff, _low_pass, stage=Stage.BANDWIDTH, starts=starts, lagless=_lagless)
     gain = (Parameter("gain", "-", 0.5, null_value=1.0),)
-    yield _effect("gain", Stage.SENSOR, "y = gain x", gain, lambda s, theta: s.but(theta[0] * s.y), [np.ones(1)])
-    yield from _dead_bands(size, unit)
+    yield scale.effect("gain", (0,), "y = gain x", gain, lambda s, theta: s.but(theta[0] * s.y), starts=[np.ones(1)])
+    yield from _dead_bands(scale, size)
     yield from _drifts(signal, size, unit)
     for variable, of, steep in (("x", "x", STEEP * size), ("dx", "dx/dt", STEEP * slope)):
         level, text = (Parameter("level", unit, size),), f"y += level sign({of})"
-        yield _effect("friction", Stage.SENSOR, text, level, _Sign(variable, steep), variant=f"of {variable}")
-    yield from _limits(signal.real[:, 0], size, unit)
+        yield scale.effect("friction", (0,), text, level, _Sign(variable, steep), variant=f"of {variable}")
+    yield from _limits(scale, signal.real[:, 0], size)
 
 
 def _of_lag(lag_s: float) -> list[float]:
@@ -125,9 +97,9 @@ def _lagless(ideal: IdealSignal, theta: Theta) -> IdealSignal:
     return replace(ideal, fine=smoothed(ideal.fine, ideal.rate_hz, Design(float(theta[0]))))
 
 
-def _dead_bands(size: float, unit: str) -> Iterator[Effect]:
-    width = Parameter("width", unit, size, positive=True, step=LOG_MOVED)
-    numbers = (width, Parameter("center", unit, 0.3 * size, step=MOVED * size))
+def _dead_bands(scale: Scale, size: float) -> Iterator[Effect]:
+    width = Parameter("width", scale.units[0], size, positive=True, step=LOG_MOVED)
+    numbers = (width, Parameter("center", scale.units[0], 0.3 * size, step=MOVED * size))
     starts = [np.array([width * size, 0.0]) for width in WIDTHS]
 
     def zone(s: SignalSamples, theta: Theta) -> SignalSamples:
@@ -140,15 +112,15 @@ def _dead_bands(size: float, unit: str) -> Iterator[Effect]:
         return s.but(from_center * past + theta[1])
 
     text = "y = x - width sign(x) where |x| > width, else 0 (about center)"
-    yield _effect("dead_band", Stage.SENSOR, text, numbers, zone, starts, variant="zone")
+    yield scale.effect("dead_band", (0,), text, numbers, zone, starts=starts, variant="zone")
     text = "y = x where |x| > width, else 0 (about center)"
-    yield _effect("dead_band", Stage.SENSOR, text, numbers, jump, starts, variant="jump", jumps=True)
+    yield scale.effect("dead_band", (0,), text, numbers, jump, starts=starts, variant="jump", jumps=True)
 
 
-def _limits(real: Samples, size: float, unit: str) -> Iterator[Effect]:
+def _limits(scale: Scale, real: Samples, size: float) -> Iterator[Effect]:
     """Limits above, below, or both: a side that is never reached is no limit."""
-    upper = Parameter("upper", unit, size, null_value=np.inf, step=MOVED * size)
-    lower = Parameter("lower", unit, size, null_value=-np.inf, step=MOVED * size)
+    upper = Parameter("upper", scale.units[0], size, null_value=np.inf, step=MOVED * size)
+    lower = Parameter("lower", scale.units[0], size, null_value=-np.inf, step=MOVED * size)
     high, low = ([float(np.quantile(real, out)) for out in outs] for outs in ([1.0 - r for r in REACHED], REACHED))
 
     def effect(variant: str, text: str, numbers: tuple[Parameter, ...], starts: list[Theta]) -> Effect:
@@ -156,7 +128,7 @@ def _limits(real: Samples, size: float, unit: str) -> Iterator[Effect]:
             minimum, maximum = theta[-1] if lower in numbers else -np.inf, theta[0] if upper in numbers else np.inf
             return s.but(np.clip(s.y, minimum, maximum))
 
-        return _effect("saturation", Stage.CONVERTER, text, numbers, clip, starts, variant=variant)
+        return scale.effect("saturation", (0,), text, numbers, clip, stage=Stage.CONVERTER, starts=starts, variant=variant)
 
     yield effect("upper", "y = min(x, upper)", (upper,), [np.array([x]) for x in high])
     yield effect("lower", "y = max(x, lower)", (lower,), [np.array([x]) for x in low])
@@ -179,8 +151,10 @@ def _drifts(signal: AlignedSignal, size: float, unit: str) -> Iterator[Effect]:
     first, last = float(signal.stamp_s[0]), float(signal.stamp_s[-1])
     middle, length = 0.5 * (first + last), last - first
     rate = (Parameter("rate", f"{unit}/s" if unit else "1/s", size / length),)
-    yield _effect("drift", Stage.SENSOR, "y += rate t", rate, lambda s, theta: s.with_added(0, theta[0] * (s.stamp_s - middle)))
-    yield _curve("drift", "catalogue", "t", "s", signal.stamp_s, KNOTS, size, unit)
+    effect = signal.scale.effect
+    yield effect("drift", (0,), "y += rate t", rate, lambda s, theta: s.with_added(0, theta[0] * (s.stamp_s - middle)))
+    curve = _curve(signal, 0, "t", "s", KNOTS)
+    yield replace(curve, name="drift", kind="catalogue", linear=False, starts=lambda ideal, real: [np.zeros(KNOTS)])
 
 
 # ── unnamed effects ──
@@ -218,39 +192,26 @@ def variables_of(samples: SignalSamples, k: int) -> dict[str, Samples]:
     return {"x": samples.x[:, k], "dx/dt": samples.dx[:, k], "t": samples.stamp_s, **samples.state}
 
 
-def _curve(
-    name: str, kind: Kind, variable: str, of: str, values: Samples, knots: int, size: float, unit: str, column: int = 0
-) -> Effect:
-    curve = SignalCurve(variable, of, np.linspace(values.min(), values.max(), knots - 2), column)
-    numbers = tuple(Parameter(f"c{j}", unit, share * size) for j, share in enumerate(curve.plausible))
-    text, starts = f"y += curve({variable})", [np.zeros(knots)] if kind == "catalogue" else None
-    return _effect(name, Stage.SENSOR, text, numbers, curve, starts, kind=kind, variable=variable, variant=f"curve({variable})")
+def _curve(signal: AlignedSignal, k: int, variable: str, unit: str, knots: int) -> Effect:
+    values, size = variables_of(signal.sampled, k)[variable], float(signal.sampled.x[:, k].std())
+    curve, text = SignalCurve(variable, unit, np.linspace(values.min(), values.max(), knots - 2), k), f"curve({variable})"
+    numbers = tuple(Parameter(f"c{j}", signal.units[k], share * size) for j, share in enumerate(curve.plausible))
+    effect = signal.scale.effect
+    return effect("unknown", (k,), f"y += {text}", numbers, curve, kind="unknown", variable=variable, variant=text)
 
 
 def unknown(signal: AlignedSignal, k: int) -> Iterator[Effect]:
     """Smooth curves of signal, derivative, time and state, in one column."""
-    sampled, unit = signal.sampled, signal.units[k]
-    size = float(sampled.x[:, k].std())
-    units = {"x": unit, "dx/dt": f"{unit}/s", "t": "s"}
-    for variable, values in variables_of(sampled, k).items():
+    units = {"x": signal.units[k], "dx/dt": f"{signal.units[k]}/s", "t": "s"}
+    for variable, values in variables_of(signal.sampled, k).items():
         if np.ptp(values) > 0 and not variable.startswith(("R", "v")):
-            knots = KNOTS_OF_TIME if variable == "t" else KNOTS
-            curve = _curve("unknown", "unknown", variable, units.get(variable, ""), values, knots, size, unit, k)
-            yield on_column(curve, signal, k)
-
-
-def on_column(effect: Effect, signal: AlignedSignal, k: int) -> Effect:
-    """The effect with the name of its column, where there are several."""
-    if signal.columns == 1:
-        return effect
-    name = signal.names[k]
-    return replace(effect, sensors=(name,), variant=f"{name}:{effect.variant}")
+            yield _curve(signal, k, variable, units.get(variable, ""), KNOTS_OF_TIME if variable == "t" else KNOTS)
 
 
 class _Driven:
     """+ gain times a channel, some time earlier, in each of some columns."""
 
-    def __init__(self, channel: str, mean: float, columns: Sequence[int]) -> None:
+    def __init__(self, channel: str, mean: float, columns: range) -> None:
         self.channel, self.mean, self.columns = channel, mean, columns
 
     def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
@@ -277,20 +238,14 @@ def driven(signal: AlignedSignal) -> Iterator[Effect]:
         yield from (_driven(signal, part, name, float(channel.mean()), spread) for part in parts)
 
 
-def _driven(signal: AlignedSignal, part: Sequence[int], name: str, mean: float, spread: float) -> Effect:
+def _driven(signal: AlignedSignal, part: range, name: str, mean: float, spread: float) -> Effect:
     """Effect of one channel on some columns, which follow it at one time."""
-    vector, unit = len(part) > 1, signal.units[part[0]] or "1"
+    unit = signal.units[part[0]] or "1"
     gain = Parameter("gain", f"{unit} per unit of {name}", float(signal.sampled.x[:, part].std(axis=0).max()) / spread)
-    gains = tuple(replace(gain, name=axis) for axis in AXES) if vector else (gain,)
-    effect = _effect(
-        "driven",
-        Stage.SENSOR,
-        f"y += gain ({name}(t - lag) - mean)",
-        (*gains, Parameter("lag", "s", 0.2)),
-        _Driven(name, mean, part),
-        [np.array([*(0.0 for _ in gains), lag]) for lag in LAGS_S],
-        kind="driven",
-        variable=name,
-        variant=name,
+    gains = tuple(replace(gain, name=axis) for axis in AXES) if len(part) > 1 else (gain,)
+    numbers, text = (*gains, Parameter("lag", "s", 0.2)), f"y += gain ({name}(t - lag) - mean)"
+    starts = [np.array([*(0.0 for _ in gains), lag]) for lag in LAGS_S]
+    forward = _Driven(name, mean, part)
+    return signal.scale.effect(
+        "driven", part, text, numbers, forward, starts=starts, kind="driven", variable=name, variant=name
     )
-    return effect if vector else on_column(effect, signal, part[0])

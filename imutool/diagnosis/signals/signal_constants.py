@@ -91,7 +91,7 @@ def torque_findings(
     signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     if not signal.constants:
         return
-    stds = scatter([log], selection.whole, "all", signal.settings.search.robust_block_s).std
+    stds = scatter(selection.whole).std
     errors = learnt_errors(log, selection.whole)
     gains = [(effect, float(theta[0])) for effect, theta in selection.whole.chosen if effect.name == GAIN]
     before = after + signal.real - signal.real / np.array(signal.constants)  # what leaves the log's numbers, taken as torques

@@ -138,10 +138,10 @@ class _Prepared(NamedTuple):
             always = (*always, *((effect, np.ones(1)) for effect in candidates if effect.name == GAIN))
             candidates = [effect for effect in candidates if effect.name != GAIN]
         if not signal.shares_epoch:
-            always = ((common.delay(0.0, common.delay_step_s(signal)), np.zeros(1)), *always)
+            always = ((common.delay(signal, "delay", 0.2), np.zeros(1)), *always)
             candidates = [effect for effect in candidates if effect.name not in DELAYS]
         elif signal.clock_std_s and not pair.sim_state:
-            always = ((common.clock(signal.clock_std_s, common.delay_step_s(signal)), np.zeros(1)), *always)
+            always = ((common.delay(signal, "clock", signal.clock_std_s), np.zeros(1)), *always)
         log = whitened(signal, np.stack([rich_residual(signal, k) for k in columns], axis=1), lsb)
         return cls(log, candidates, always, lsb)
 
@@ -165,7 +165,7 @@ def _refined(log: WhitenedLog, selection: Selection, settings: DiagnoseSettings)
         for s in (selection.fitted, selection.whole)
     ]
     fitted, whole = fit([log], chosen[0]), fit([log], chosen[1], part="all")
-    stds = scatter([log], whole, "all", settings.search.robust_block_s).std
+    stds = scatter(whole).std
     effects = {effect.key: (effect, theta) for effect, theta in whole.chosen}
     selected = [
         replace(s, effect=effects[s.effect.key][0], theta=effects[s.effect.key][1], std=stds[s.effect.key])
@@ -216,9 +216,8 @@ def _beside_stiction(prepared: _Prepared, found: Selection, driven: Sequence[Eff
 
 def catalogue(signal: AlignedSignal) -> list[Effect]:
     """Effects that a signal can have by name."""
-    scale = signal.scale()
     any_signal = common.named(signal) if signal.columns == 1 else ()
-    return [*any_signal, *(effect for effects in CATALOGUE.get(signal.kind, ()) for effect in effects(scale))]
+    return [*any_signal, *(effect for effects in CATALOGUE.get(signal.kind, ()) for effect in effects(signal.scale))]
 
 
 # ── report ──
@@ -238,7 +237,7 @@ def _summarized(
         each = zip(findings, selection.selected, strict=True)
         findings = [with_learnt_error(finding, selected.effect, errors) for finding, selected in each]
     p_values = {name: min((f.p_value for f in findings if f.signal in (name, pair.name)), default=1.0) for name in names}
-    place = partial(locate_findings, [pair], [before], [after], level, (), p_values, settings.localization)
+    place = partial(locate_findings, [pair], [before], [after], level, (), p_values)
     floor = level.copy()
     for k in range(pair.columns):
         if lsb[k] > settings.timestamps.min_digits * float(level[k]):
@@ -252,7 +251,7 @@ def _summarized(
         floor = level = np.hypot(
             level, MODEL_ERROR * np.array([held_out_rms(logs, [before], [before], n).rms_before for n in names])
         )
-    unexplained = unexplained_residuals(logs, [after], floor, settings.held_out)
+    unexplained = unexplained_residuals(logs, [after], floor)
     maximum = settings.held_out.max_white_ratio
     beyond = any(not residual.white and residual.rms > maximum * residual.noise_floor for residual in unexplained.values())
     gains = {f.signal: f.parameters["gain"].value for f in findings if f.effect == "actuator_gain"}
@@ -291,4 +290,4 @@ def _unseen(log: WhitenedLog, candidates: Sequence[Effect], selection: Selection
     for effect in candidates:
         if effect.key not in found:
             columns = f" of {', '.join(effect.sensors)}" if 0 < len(effect.sensors) < log.pair.columns else ""
-            yield from (f"{name}{columns}" for name in unobservable([log], [effect], settings.search))
+            yield from (f"{name}{columns}" for name in unobservable([log], [effect]))

@@ -8,14 +8,14 @@ is that of all effects: one term at a time, against curves, on unseen time.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from imutool.array_types import Float64
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.effect import Effect, Parameter, Theta
 from imutool.sensor.robot_effects.signal_samples import Samples, SignalSamples
 
 WORDS = {"ddq": "acceleration", "dq": "velocity", "q": "position", "w": "wheel"}
@@ -135,13 +135,10 @@ def _effect(
     c = Parameter("c", f"{unit or '1'} per unit of {text}", size / spread)
     numbers = (c,) if scale is None else (c, Parameter("s", "", scale, positive=True, step=0.02))
     starts = None if scale is None else [np.array([0.1 * size / spread, share * scale]) for share in SCALES]
-    sensors = (signal.names[k],) if signal.columns > 1 else ()
-    column = signal.names[k].rpartition(".")[2]
-    given = None if starts is None else lambda ideal, real: starts
-    effect = Effect(
-        "unknown", Stage.SENSOR, sensors, f"{column} += c {text}", numbers, "it varies", term, starts is None, given
+    equation = f"{signal.names[k].rpartition('.')[2]} += c {text}"
+    return signal.scale.effect(
+        "unknown", (k,), equation, numbers, term, starts=starts, kind="unknown", variable=text, variant=text
     )
-    return replace(effect, kind="unknown", variable=text, variant=f"{signal.names[k]}:{text}")
 
 
 def python(variable: str, column: str) -> str:

@@ -27,6 +27,7 @@ FULL = 3  # findings with a sentence in the conclusion; the rest by name
 LISTED = 4  # unobservable effects by name; the rest are counted
 ENTRIES = 6  # of an effect that are listed one by one
 WIDE = 40  # letters of a value in a table
+PREPOSITIONS = ("after", "in", "when")  # with which a regime may begin
 AS_BEFORE = 2e-3  # relative change of a root mean square below which it is `as before`
 CERTAIN = 1e-9  # p-value below which no number is given
 COUNTS = ("No effect", "One effect", "Two effects", "Three effects", "Four effects", "Five effects")
@@ -271,23 +272,7 @@ def _regime(located: Sequence[Located], signal: str) -> str:
         return f" throughout{regime.removeprefix('always')}"
     if place.extent == "intermittent":
         return " from time to time"
-    word = regime.split()[0].lower()
-    starts = {
-        "when",
-        "while",
-        "where",
-        "at",
-        "in",
-        "on",
-        "above",
-        "below",
-        "during",
-        "all",
-        "throughout",
-        "after",
-        "before",
-    }
-    return f" {regime}" if word in starts else f" at {regime}"
+    return f" {regime}" if regime.split()[0] in PREPOSITIONS else f" at {regime}"
 
 
 def _seconds(seconds: float) -> str:

@@ -42,7 +42,7 @@ class Scale:
         equation: str,
         parameters: tuple[Parameter, ...],
         forward: Callable[[Any, Theta], Any],
-        observable_if: str,
+        observable_if: str = "it varies",
         *,
         stage: Stage = Stage.SENSOR,
         starts: list[Theta] | None = None,
@@ -69,8 +69,9 @@ def delay_of_all(scale: Scale, name: str) -> Effect:
     starts = [np.zeros(1)] if abs(scale.lag_s) < 1e-9 else [np.zeros(1), np.array([scale.lag_s])]
     text, needs = "y(t) = x(t - delay)", "it moves"
     number = (Parameter("delay", "s", max(0.2, abs(scale.lag_s)), step=step),)
-    return scale.effect(name, scale.columns, text, number, _late, needs, stage=Stage.CLOCK, starts=starts)
+    return scale.effect(name, scale.columns, text, number, late, needs, stage=Stage.CLOCK, starts=starts)
 
 
-def _late(taken_s: np.ndarray, theta: Theta) -> np.ndarray:
+def late(taken_s: np.ndarray, theta: Theta) -> np.ndarray:
+    """When the samples were taken, of a delay."""
     return np.asarray(taken_s - theta[0])

@@ -14,7 +14,8 @@ from imutool.units import AXES
 from imutool.viewing.html.drawing import Panel, Picture, legend
 from imutool.viewing.html.page import BEFORE, HELD, INK, LEVELS, MODELS
 from imutool.viewing.html.report_wording import best_run, format_quantity, run_name
-from imutool.viewing.model.run_data import RunData, Trace, gap_rows, path_rows, split_at_gaps
+from imutool.viewing.model.decimation import path_rows
+from imutool.viewing.model.run_data import RunData, Trace, gap_rows, split_at_gaps
 
 HEIGHT_INCH = 4.3
 MAX_POINTS = 1500  # of a path

@@ -24,11 +24,11 @@ from imutool.inertial.metrics import evaluate
 from imutool.inertial.strapdown import StartPose, gaps_crossed, stretch_with_truth, with_velocity
 from imutool.processes.system import release_memory
 from imutool.recording import Poses, Recording, Scalars, seconds
+from imutool.viewing.model.decimation import MAX_CURVE_ROWS
 from imutool.viewing.model.events import Event, events_within, finding_events, stop_events, survey_events, worst_error_events
 from imutool.viewing.model.read_log import read_log
 from imutool.viewing.model.run_data import (
     LEVELLING_S,
-    MAX_CURVE_ROWS,
     TRUE_BIAS,
     TRUTH,
     Run,

@@ -21,7 +21,7 @@ from imutool.viewing.rerun import rr, rrb
 from imutool.viewing.rerun.entities import styles
 from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, EVENT_COLOR, GREY, MODEL_COLORS, RAW_COLOR, RAW_WIDTH, Color
 from imutool.viewing.rerun.plots import frame, whole_time_axis
-from imutool.viewing.rerun.sdk import elapsed_column, entity_path, new_stream, rrd_bytes, unique_names
+from imutool.viewing.rerun.sdk import elapsed_column, entity_path, log_columns, log_static, new_stream, rrd_bytes, unique_names
 
 CURVES = ("real", "before", "after")  # columns of `samples`; `left` holds real minus before and real minus after
 COLORS: tuple[Color, ...] = (GREY, RAW_COLOR, MODEL_COLORS[0])
@@ -57,7 +57,7 @@ def log(d: Diagnosis, to: rr.RecordingStream) -> None:
     `/LOG/events` (texts at the ends of located and unseen intervals), `/LOG/where/{SIGNAL}/{AXIS}` and
     `/LOG/where/unseen` (states `here` and `elsewhere`), `/report`. Two logs of one name get a number.
     """
-    to.log("report", rr.TextDocument(_report(d), media_type="text/markdown"), static=True, strict=True)
+    log_static(to, "report", rr.TextDocument(_report(d), media_type="text/markdown"))
     for name, trace in zip(names(d.traces), d.traces, strict=True):
         t_ns = _nanoseconds(trace.t_s)
         for column in range(6):
@@ -109,9 +109,8 @@ def _log_tab(name: str, trace: Traces) -> rrb.Vertical:
 
 def _log_curves(to: rr.RecordingStream, entity: str, t_ns: Times, values: Float64[np.ndarray, "n k"], which: slice) -> None:
     """One curve per column after its style, so that the viewer chooses no colour."""
-    to.log(entity, styles.line_style(CURVES[which], COLORS[which], WIDTHS[which]), static=True, strict=True)
-    # strict: Rerun only warns of a length that does not match, and then the rows are missing
-    to.send_columns(entity, [elapsed_column(t_ns)], rr.Scalars.columns(scalars=values), strict=True)
+    style = styles.line_style(CURVES[which], COLORS[which], WIDTHS[which])
+    log_columns(to, entity, style, [elapsed_column(t_ns)], rr.Scalars.columns(scalars=values))
 
 
 def _log_intervals(to: rr.RecordingStream, d: Diagnosis, name: str, trace: Traces) -> None:
@@ -127,11 +126,11 @@ def _log_intervals(to: rr.RecordingStream, d: Diagnosis, name: str, trace: Trace
                 inside.setdefault((located.signal, axis) if axis else (located.signal,), []).append((first, last))
     for key, intervals in inside.items():
         entity, color = entity_path((name, "where"), *key), UNSEEN_COLOR if key == ("unseen",) else EVENT_COLOR
-        to.log(entity, styles.state_style(" ".join(key), color), static=True, strict=True)
+        style = styles.state_style(" ".join(key), color)
         times, states = styles.state_changes(
             sorted((round(first * 1e9), round(last * 1e9)) for first, last in intervals), round(float(trace.t_s[0]) * 1e9)
         )
-        to.send_columns(entity, [elapsed_column(np.array(times))], rr.StateChange.columns(state=states), strict=True)
+        log_columns(to, entity, style, [elapsed_column(np.array(times))], rr.StateChange.columns(state=states))
     if texts:
         t_s, levels, words = zip(*sorted(texts, key=lambda text: text[0]), strict=True)
         columns = rr.TextLog.columns(text=list(words), level=list(levels))

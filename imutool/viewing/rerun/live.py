@@ -197,24 +197,16 @@ class _Imu:
     def begin(self, to: rr.RecordingStream) -> None:
         """Log styles before any data."""
         colors = {"raw": RAW_COLOR, "debiased": MODEL_COLORS[0]}
-        to.log(self._path("world"), rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
+        sdk.log_static(to, self._path("world"), rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         for role, color in colors.items():
-            to.log(self._path("world", role, "path"), styles.path_style(role, color), static=True, strict=True)
-            to.log(
-                self._path("world", role, "body"), *styles.body_style(role, role, color, SCENE_SIZE_M), static=True, strict=True
-            )
+            sdk.log_static(to, self._path("world", role, "path"), styles.path_style(role, color))
+            sdk.log_static(to, self._path("world", role, "body"), *styles.body_style(role, role, color, SCENE_SIZE_M))
         for kind in SENSORS:
             for role in self._paths:
-                to.log(
-                    self._path("imu", kind, role), styles.axis_curves(role, styles.axis_names(role)), static=True, strict=True
-                )
-            to.log(
-                self._path("bias", kind, "estimated"),
-                styles.axis_curves("debiased", styles.axis_names("estimated")),
-                static=True,
-                strict=True,
-            )
-            to.log(self._path("bias", kind, "sigma"), styles.sigma_curves(), static=True, strict=True)
+                sdk.log_static(to, self._path("imu", kind, role), styles.axis_curves(role, styles.axis_names(role)))
+            estimated = styles.axis_curves("debiased", styles.axis_names("estimated"))
+            sdk.log_static(to, self._path("bias", kind, "estimated"), estimated)
+            sdk.log_static(to, self._path("bias", kind, "sigma"), styles.sigma_curves())
 
     def log(self, block: DebiasedBlock, streams: list[rr.RecordingStream]) -> None:
         """Log the new samples of a block: after the recovery of a damaged log some come again."""

@@ -118,6 +118,20 @@ def trace_path(data: RunData, trace: Trace, scope: Scope, *parts: str) -> str:
     return entity_path(scope, *parts)
 
 
+def log_static(to: rr.RecordingStream, entity: str, *what: rr.AsComponents) -> None:
+    """Log what holds at all times."""
+    to.log(entity, *what, static=True, strict=True)
+
+
+def log_columns(
+    to: rr.RecordingStream, entity: str, style: rr.AsComponents, times: Sequence[rr.TimeColumn], columns: rr.ComponentColumnList
+) -> None:
+    """Log columns after their style, so that the viewer chooses none."""
+    log_static(to, entity, style)
+    # strict: Rerun only warns of a length that does not match, and then the rows are missing
+    to.send_columns(entity, times, columns, strict=True)
+
+
 def time_columns(stamp_ns: Times, log_ns: Times, start_ns: int) -> list[rr.TimeColumn]:
     """Time columns in nanoseconds: time since the first IMU sample, header stamp, log time."""
     return [

@@ -17,9 +17,10 @@ from imutool.config import build
 from imutool.diagnosis.audit import audit, lines, motion, simulator_faults
 from imutool.diagnosis.audit.axes import Matrix
 from imutool.diagnosis.audit.bandwidth import max_filter_delay
+from imutool.diagnosis.audit.faults import clear
 from imutool.diagnosis.audit.motion import kinematic_fit, kinematics
-from imutool.diagnosis.audit.motion_faults import clear, timing_faults
 from imutool.diagnosis.audit.noise import Expected, fast_noise, noise_faults
+from imutool.diagnosis.audit.timing import timing_faults
 from imutool.diagnosis.result import Estimate
 from imutool.mcap_io.write import write
 from imutool.noise.datasheet import Noise

@@ -164,7 +164,7 @@ def selected(real: Recording, sim: Recording) -> Selection:
     settings = DiagnoseSettings()
     pairs = list(with_simulation(real, sim, settings))
     candidates = candidates_for(pairs)
-    logs = [whitened(pair, for_noise(candidates), settings.band) for pair in pairs]
+    logs = [whitened(pair, for_noise(candidates)) for pair in pairs]
     named, always = without_unseen_offset(candidates, pairs)
     return select_effects(logs, named, always=always)
 

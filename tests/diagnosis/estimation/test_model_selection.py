@@ -25,7 +25,7 @@ from imutool.diagnosis.estimation.observability import with_plainer_effects
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.estimation.trial import verdicts
 from imutool.diagnosis.estimation.trial.effect_forms import in_forms
-from imutool.diagnosis.estimation.trial.lag_start import with_delay_of_accel, with_filter_of_each_sensor
+from imutool.diagnosis.estimation.trial.filter_forms import with_delay_of_accel, with_filter_of_each_sensor
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.trial.walking_bias import std_of_unseen_walk, with_bias_walk
 from imutool.diagnosis.settings import SearchSettings
@@ -272,7 +272,7 @@ def test_two_gains_of_an_axis_that_never_changes_its_sign_are_a_scale() -> None:
     pair = planted.pair(planted.rich(), {"accel_scale": [0.0, 0.0, 0.02]})
     logs, named = [planted.weighed(pair)], planted.catalogue()
     told = fit(logs, planted.acting({"accel_scale_asymmetry": [0.0] * 3}))
-    assert with_plainer_effects(logs, told, named).keys == ("accel_scale",)
+    assert with_plainer_effects(told, named).keys == ("accel_scale",)
 
 
 def test_two_gains_beside_a_scale_are_both_named() -> None:
@@ -297,7 +297,7 @@ def test_noise_that_a_filter_has_coloured_is_no_vibration_and_a_line_on_it_is_on
     passed = sosfilt(butter(2, BAND_HZ, "bandpass", fs=planted.RATE_HZ, output="sos"), white, axis=0)
     line = line_m_s2 * np.sin(2.0 * np.pi * 33.3 * felt.t_s)[:, None] * [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
     pair = planted.pair(felt, seed=51, added=PASSED * passed - (1.0 - WHITE) * white + line)
-    found = select_effects([whitened(pair, (), pair.settings.band)], catalogue.diagnosed(["vibration"]))
+    found = select_effects([whitened(pair, ())], catalogue.diagnosed(["vibration"]))
     assert names(found) == (["vibration"] if line_m_s2 else [])
 
 
@@ -308,7 +308,7 @@ def test_a_line_that_turns_its_phase_is_no_vibration(turns: float) -> None:
     phase = turns * np.cumsum(np.random.default_rng(4).normal(size=len(felt.t_s)))
     line = np.sin(2.0 * np.pi * 31.0 * felt.t_s + phase)[:, None] * [0.0, 0.0, 0.0, 0.1, 0.1, 0.4]
     pair = planted.pair(felt, seed=52, added=line)
-    found = select_effects([whitened(pair, (), pair.settings.band)], catalogue.diagnosed(["vibration"]))
+    found = select_effects([whitened(pair, ())], catalogue.diagnosed(["vibration"]))
     assert names(found) == ([] if turns else ["vibration"])
 
 
@@ -339,7 +339,7 @@ def test_what_grows_with_the_velocity_is_no_hysteresis_of_which_much_is_left() -
 def test_a_late_accelerometer_is_no_hysteresis_and_what_a_delay_leaves_is_no_delay(what: str) -> None:
     logs = [planted.weighed(with_force(1, what))]
     (hysteresis,) = (one for one in planted.catalogue() if one.name == "accel_hysteresis" and not one.variant)
-    found = with_delay_of_accel(logs, fit(logs, ((hysteresis, np.array([0.1])),)), planted.catalogue())
+    found = with_delay_of_accel(fit(logs, ((hysteresis, np.array([0.1])),)), planted.catalogue())
     both = {effect.name: float(theta[0]) for effect, theta in found.chosen}
     if what == "late":
         assert both == {name: pytest.approx(-LATE_S, abs=1e-3) for name in ("clock_offset", "gyro_delay")}
@@ -422,10 +422,8 @@ def test_the_first_effect_that_goes_in_any_case_is_the_one_that_all_verdicts_nam
         planted.catalogue(),
     )
     now = fit(logs, planted.acting({"gyro_scale": [0.02, 0.0, 0.01], "accel_scale": [0.0] * 3, "clock_offset": [0.0]}))
-    known, settings = Candidates(logs, candidates), logs[0].pair.settings.search
-    search = model_selection._Search(
-        logs, candidates, (), (), settings, lambda word: None, known, before=fit(logs, ()).objective
-    )
+    known = Candidates(logs, candidates)
+    search = model_selection._Search(logs, candidates, (), (), lambda word: None, known, before=fit(logs, ()).objective)
     short = search.tested(now)
     monkeypatch.setattr(verdicts, "FOLLOWING", frozenset(now.keys))  # whatever it is, the others may matter to it
     whole = search.tested(now)
@@ -456,12 +454,11 @@ def test_of_what_comes_after_a_refuted_effect_only_a_bound_is_asked_unless_it_co
     model_error: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truth = {"clock_offset": [0.001], "gyro_scale": [0.02, 0.0, 0.01], "lever_arm": [0.1, -0.1, 0.05]}
-    log = planted.weighed(planted.pair(planted.rich(4, DURATION_S), truth, 4))
+    pair = planted.pair(planted.rich(4, DURATION_S), truth, 4)
+    search_settings = msgspec.structs.replace(pair.settings.search, model_error=model_error)
+    log = planted.weighed(replace(pair, settings=msgspec.structs.replace(pair.settings, search=search_settings)))
     candidates, now = planted.catalogue(), fit([log], planted.acting(truth), part="all")
-    settings, asked_of = (
-        msgspec.structs.replace(log.pair.settings.search, model_error=model_error),
-        list[tuple[int, int | None]](),
-    )
+    asked_of = list[tuple[int, int | None]]()
 
     def recorded(whole: Fit, k: int, iterations: int | None = None) -> tuple[float, float]:
         asked_of.append((k, iterations))
@@ -469,7 +466,7 @@ def test_of_what_comes_after_a_refuted_effect_only_a_bound_is_asked_unless_it_co
 
     monkeypatch.setattr(verdicts, "gain_of", recorded)
     known = Candidates([log], candidates)
-    search = model_selection._Search([log], candidates, (), (), settings, lambda word: None, known, before=0.0)
+    search = model_selection._Search([log], candidates, (), (), lambda word: None, known, before=0.0)
     offset, *_ = search.verdicts(now, 0, Forked(lambda: 1))
     assert (offset.false_discovery_rate == 1.0) == (model_error == 0.5)
     assert asked_of == [(0, 1), (0, None), (1, 0), (2, 0), *([(1, None), (2, None)] if model_error == 0.5 else [])]
@@ -479,9 +476,9 @@ def test_of_what_comes_after_a_refuted_effect_only_a_bound_is_asked_unless_it_co
 def test_unseen_time_is_not_waited_for_where_chance_explains_the_first_effect() -> None:
     truth = {"gyro_scale": [0.02, 0.0, 0.01]}
     log = planted.weighed(planted.pair(planted.rich(4, DURATION_S), truth, 4))
-    candidates, settings = planted.catalogue(), log.pair.settings.search
+    candidates = planted.catalogue()
     known = Candidates([log], candidates)
-    search = model_selection._Search([log], candidates, (), (), settings, lambda word: None, known, before=0.0)
+    search = model_selection._Search([log], candidates, (), (), lambda word: None, known, before=0.0)
 
     def unseen() -> int:
         raise AssertionError("nobody needs it")
@@ -800,7 +797,7 @@ def test_a_gyro_is_not_ahead_of_a_slow_accelerometer_but_the_clock_is() -> None:
     logs = [planted.weighed(through(felt, ("clock_skew", [0.0]), slow, -0.004))]
     delay, filtered = ([of for of in planted.catalogue() if of.key == key] for key in ("gyro_delay", f"{slow[0]}:accel"))
     wrong = fit(logs, ((delay[0], np.array([-0.004])), (filtered[0], np.array([33.0, 0.7]))))
-    found = with_filter_of_each_sensor(logs, wrong, planted.catalogue())
+    found = with_filter_of_each_sensor(wrong, planted.catalogue())
     assert {effect.key for effect, _ in found.chosen} == {"clock_offset", filtered[0].key}
     assert found.chosen[0][1] == pytest.approx([0.004], abs=3e-4)
 
@@ -810,7 +807,7 @@ def test_a_gyro_that_is_ahead_is_plainer_than_a_clock_and_a_filter() -> None:
     logs = [planted.weighed(planted.pair(trembling(6.0), {"gyro_delay": [-0.00125]}))]
     delay = next(of for of in planted.catalogue() if of.key == "gyro_delay")
     now = fit(logs, ((delay, np.array([-0.001])),))
-    assert with_filter_of_each_sensor(logs, now, planted.catalogue()) is now
+    assert with_filter_of_each_sensor(now, planted.catalogue()) is now
 
 
 def test_a_filter_of_each_sensor_that_shows_its_lag_alone_has_no_order_by_chance() -> None:
@@ -858,7 +855,7 @@ def test_a_dead_band_of_noisy_readings_is_as_unsure_as_its_edges_are() -> None:
     real = pair.real.copy()
     real[:, :3] = np.where(np.abs(real[:, :3]) < width, 0.0, real[:, :3])
     every = [one for one in planted.catalogue() if one.name != "second_order_low_pass"]
-    found = select_effects([whitened(replace(pair, real=real), every, pair.settings.band)], planted.catalogue())
+    found = select_effects([whitened(replace(pair, real=real), every)], planted.catalogue())
     assert names(found) == ["gyro_dead_band"]
     assert sure(found, "gyro_dead_band", [width])
 
@@ -911,10 +908,8 @@ def test_a_name_that_leaves_no_more_takes_the_place_of_a_term() -> None:
     pair = planted.pair(planted.planar(), {"accel_misalignment": [0.0, 0.0, 0.06, 0.0, 0.0, 0.0]})
     log, named = planted.weighed(pair), planted.catalogue()
     term = next(effect for effect in unnamed.terms(unnamed.like([pair])) if effect.equation == "accel.y += c f_x")
-    known, settings = Candidates([log], (*named, term)), pair.settings.search
-    search = model_selection._Search(
-        [log], named, (term,), (), settings, lambda text: None, known, before=fit([log], ()).objective
-    )
+    known, before = Candidates([log], (*named, term)), fit([log], ()).objective
+    search = model_selection._Search([log], named, (term,), (), lambda text: None, known, before=before)
     assert list(search.simplified(fit([log], ((term, np.zeros(1)),))).keys) == ["accel_misalignment"]
 
 

@@ -44,7 +44,7 @@ def noise(log: WhitenedImu) -> np.ndarray:
 
 @functools.cache
 def quiet() -> np.ndarray:
-    return noise(whitened(beside_poses(), WITHOUT, BAND))
+    return noise(whitened(beside_poses(), WITHOUT))
 
 
 def test_a_log_with_too_few_values_without_a_gap_is_refused() -> None:
@@ -52,18 +52,18 @@ def test_a_log_with_too_few_values_without_a_gap_is_refused() -> None:
     pair = beside_poses()
     gaps = np.arange(len(pair.real)) * pair.period_s % 0.4 < 0.2
     with pytest.raises(DataError, match=r"0 values every 0\.\d+ s are there without a gap; expected 12 or more"):
-        whitened(replace(pair, known=np.repeat(~gaps[:, None], 6, axis=1)), WITHOUT, BAND)
+        whitened(replace(pair, known=np.repeat(~gaps[:, None], 6, axis=1)), WITHOUT)
 
 
 def test_a_stretch_with_too_few_rows_is_left_out_beside_a_longer_one(caplog: pytest.LogCaptureFixture) -> None:
     pair = beside_poses()
     gaps = np.arange(len(pair.real)) * pair.period_s % 0.4 < 0.2
     poor = replace(pair, known=np.repeat(~gaps[:, None], 6, axis=1))
-    (log,) = whitened_stretches([poor, pair], lambda _: WITHOUT, BAND)
+    (log,) = whitened_stretches([poor, pair], lambda _: WITHOUT)
     assert log.pair.known is None
     assert "are left out: " in caplog.text
     with pytest.raises(DataError, match="0 values every"):
-        whitened_stretches([poor], lambda _: WITHOUT, BAND)
+        whitened_stretches([poor], lambda _: WITHOUT)
 
 
 @pytest.mark.parametrize(
@@ -77,13 +77,13 @@ def test_a_stretch_with_too_few_rows_is_left_out_beside_a_longer_one(caplog: pyt
     ],
 )
 def test_an_effect_is_not_taken_for_noise(effects: dict[str, list[float]]) -> None:
-    with_it = noise(whitened(beside_poses(effects), WITHOUT, BAND))
+    with_it = noise(whitened(beside_poses(effects), WITHOUT))
     near = NEAR_A_JUMP if "clock_jump" in effects else NEAR
     assert (with_it / quiet() < near).all(), with_it / quiet()
 
 
 def test_rows_of_noise_have_the_size_that_is_told() -> None:
-    log = whitened(beside_poses(), WITHOUT, BAND)
+    log = whitened(beside_poses(), WITHOUT)
     pair = log.pair
     white = log.whiten(pair.real - planted.ideal(FELT) - planted.BIAS)[log.rows("all")]
     assert np.abs((white**2).mean(axis=0) - 1.0).max() < 0.25
@@ -92,7 +92,7 @@ def test_rows_of_noise_have_the_size_that_is_told() -> None:
 def test_what_has_no_name_on_one_axis_makes_that_axis_little_noisier() -> None:
     odd = np.zeros((len(FELT.t_s), 6))
     odd[:, 2] = 0.5 * np.sign(np.sin(40.0 * FELT.gyro[:, 0]))
-    with_it = noise(whitened(beside_poses(added=odd), WITHOUT, BAND))
+    with_it = noise(whitened(beside_poses(added=odd), WITHOUT))
     assert with_it[2] <= 1.01 * BAND.noisy_axis * np.median(with_it[:3])
     assert (with_it[[0, 1, 3, 4, 5]] / quiet()[[0, 1, 3, 4, 5]] < NEAR).all()
 
@@ -153,7 +153,7 @@ def fast(seed: int, count: int) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_what_fast_motion_the_positions_do_not_follow_is_no_lever_arm(seed: int) -> None:
-    log = whitened(follows_in_slow_motion(seed), (*WITHOUT, SMOOTHED), BAND)
+    log = whitened(follows_in_slow_motion(seed), (*WITHOUT, SMOOTHED))
     assert select_effects([log], catalogue.diagnosed(["lever_arm"])).selected == ()
     assert log.pair.band_hz == pytest.approx(3.0)
 

@@ -36,7 +36,7 @@ def shown(felt: object, names: list[str] | None = None, *, noise: float = 1.0, k
     white = Whitener(np.ones((6, 1)), noise * planted.NOISE)
     log = WhitenedLog(pair, white if known is None else white.counting(known))
     some = [one for one in planted.catalogue() if names is None or one.name in names]
-    return set(unobservable([log], some, SETTINGS))
+    return set(unobservable([log], some))
 
 
 def test_a_motion_about_every_axis_shows_every_scale() -> None:
@@ -81,7 +81,7 @@ def test_an_axis_of_which_nothing_is_known_shows_nothing() -> None:
 def test_a_mount_has_no_negative_share(shares: list[float], beyond: bool) -> None:
     log = planted.weighed(planted.pair(planted.shaken(2)))
     ((effect, theta),) = planted.acting({"mount_resonance": [30.0, 0.05, *shares]})
-    assert beyond_the_band(effect, theta, [log], SETTINGS) == beyond
+    assert beyond_the_band(effect, theta, [log]) == beyond
 
 
 @pytest.mark.parametrize(("zeta", "beyond"), [(0.9, False), (17.6, True)])
@@ -89,7 +89,7 @@ def test_an_overdamped_mount_is_a_lag_and_no_answer(zeta: float, beyond: bool) -
     """Shares above one of such a mount are a delay (Padé)."""
     log = planted.weighed(planted.pair(planted.shaken(2)))
     ((effect, theta),) = planted.acting({"mount_resonance": [1.0, zeta, 1.9, 2.0, 1.9]})
-    assert beyond_the_band(effect, theta, [log], SETTINGS) == beyond
+    assert beyond_the_band(effect, theta, [log]) == beyond
 
 
 @pytest.mark.parametrize(("sim_noise", "beyond"), [(0.0, False), (1e-3, False), (1e-2, True)])
@@ -97,7 +97,7 @@ def test_a_dead_band_within_the_noise_of_a_simulation_is_that_noise(sim_noise: f
     """In rad/s of a sample: what the filter leaves of it at rest, no gyro reads."""
     pair = replace(planted.pair(planted.shaken(2)), sim_noise=np.full(6, sim_noise))
     ((effect, theta),) = planted.acting({"gyro_dead_band": [0.015]})
-    assert beyond_the_band(effect, theta, [planted.weighed(pair)], SETTINGS) == beyond
+    assert beyond_the_band(effect, theta, [planted.weighed(pair)]) == beyond
 
 
 @pytest.mark.parametrize(("periodic", "beyond"), [(True, True), (False, False)])
@@ -107,7 +107,7 @@ def test_a_line_of_the_bodys_own_motion_is_no_vibration(periodic: bool, beyond: 
     shaken = 0.2 * rng.normal(size=(len(felt.t_s), 3)) + periodic * np.sin(2.0 * np.pi * STEPS_HZ * felt.t_s)[:, None]
     pair = replace(planted.pair(replace(felt, accel=felt.accel + shaken)), band_hz=STEPS_HZ + 2.0)
     ((effect, theta),) = planted.acting({"vibration": [STEPS_HZ, *(0.05 * np.ones(6)), *np.zeros(6)]})
-    assert beyond_the_band(effect, theta, [planted.weighed(pair)], SETTINGS) == beyond
+    assert beyond_the_band(effect, theta, [planted.weighed(pair)]) == beyond
 
 
 RINGS = [4.0, 0.02, 0.0, 0.0, 0.5]  # above the band of these poses, lightly damped, along z alone
@@ -124,7 +124,7 @@ def test_a_mount_beyond_the_poses_has_to_ring_in_the_samples(
     felt = replace(felt, accel=felt.accel + 0.05 * np.sin(2.0 * np.pi * RINGS[0] * felt.t_s)[:, None])
     log = planted.weighed(replace(planted.pair(felt, real, 1), band_hz=band_hz))
     ((effect, theta),) = planted.acting({"mount_resonance": RINGS})
-    assert beyond_the_band(effect, theta, [log], SETTINGS) == beyond
+    assert beyond_the_band(effect, theta, [log]) == beyond
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_a_clock_that_jumps_right_after_the_start_has_an_offset(truth: dict[str,
     logs = [planted.weighed(planted.pair(planted.rich(), truth))]
     jump, *others = catalogue.diagnosed(["clock_jump", "clock_offset", "clock_skew"])
     found = fit(logs, ((jump, np.array([1.0 if named == "clock_offset" else 6.0, 0.01])),))
-    simpler = with_plainer_effects(logs, found, (jump, *others))
+    simpler = with_plainer_effects(found, (jump, *others))
     assert simpler.keys == (named,)
     assert simpler.chosen[0][1][-1] == pytest.approx(0.01, abs=1e-4)
 
@@ -145,7 +145,7 @@ def test_a_clock_that_runs_fast_is_no_jump_in_the_middle_of_the_log() -> None:
     middle_s = 0.5 * float(logs[0].pair.stamp_s[-1])
     jump, *others = catalogue.diagnosed(["clock_jump", "clock_offset", "clock_skew"])
     found = fit(logs, ((jump, np.array([middle_s, 2e-4 * middle_s])),))
-    simpler = with_plainer_effects(logs, found, (jump, *others))
+    simpler = with_plainer_effects(found, (jump, *others))
     assert simpler.keys == ("clock_skew",)
     assert simpler.chosen[0][1][0] == pytest.approx(2e-4, rel=0.1)
 
@@ -161,7 +161,7 @@ def test_a_steady_clock_stands_for_one_that_wanders_and_is_given_up_where_it_can
         return trials[-1][1]
 
     monkeypatch.setattr("imutool.diagnosis.estimation.observability.fit", recorded)
-    steady = with_steady_clock(logs, found, clocks, {effect.key: logs[0].pair.starts(effect) for effect in clocks})
+    steady = with_steady_clock(found, clocks, {effect.key: logs[0].pair.starts(effect) for effect in clocks})
     assert steady.keys == ("clock_skew", "clock_jump")
     assert len(trials) == 6
     for limit, trial in trials:
@@ -184,7 +184,7 @@ def test_three_equal_scales_are_gravity_within_what_the_earth_has(
     logs = [planted.weighed(planted.pair(planted.rich(), truth))]
     effects = catalogue.diagnosed(["accel_scale", "gravity"])
     found = fit(logs, ((effects[0], np.array(begun[1])),))
-    assert with_plainer_effects(logs, found, effects).keys == (named,)
+    assert with_plainer_effects(found, effects).keys == (named,)
 
 
 def test_a_drift_that_follows_the_logs_temperature_has_that_name() -> None:
@@ -195,7 +195,7 @@ def test_a_drift_that_follows_the_logs_temperature_has_that_name() -> None:
     for channels, named in ((warm, "temperature"), ({"temperature": 25.0 + np.sin(felt.t_s)}, "gyro_bias_drift")):
         logs = [planted.weighed(planted.pair(replace(felt, channels=channels), truth))]
         found = fit(logs, ((drift, np.array(truth["gyro_bias_drift"])),))
-        assert with_plainer_effects(logs, found, (drift, temperature)).keys == (named,)
+        assert with_plainer_effects(found, (drift, temperature)).keys == (named,)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from imutool.diagnosis.estimation.trial.unseen_time import first_refuted, predic
 from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 
 FELT = planted.shaken(duration_s=45.0)
-BLOCK_S = 5.0
 SEEDS = 16
 LASTS = 0.98  # from one sample at 100 Hz to the next: half a second
 SPREAD = (0.7, 1.35)  # of sixteen times three numbers of unit variance, not quite independent
@@ -33,7 +32,7 @@ def noisy(seed: int, lasting: bool) -> tuple[WhitenedLog, Fit, Scatter]:
         added = 2.0 * planted.NOISE * lfilter([np.sqrt(1.0 - LASTS**2)], [1.0, -LASTS], white, axis=0)
     log = planted.weighed(planted.pair(FELT, {"gyro_scale": SCALE}, seed, added=added))
     found = fit([log], planted.acting({"gyro_scale": [0.0] * 3}), part="all")
-    return log, found, scatter([log], found, "all", BLOCK_S)
+    return log, found, scatter(found)
 
 
 def z(found: Fit, std: np.ndarray) -> np.ndarray:
@@ -69,9 +68,9 @@ def test_poses_that_err_make_a_scale_as_unsure_as_they_dilute_it() -> None:
     pair = replace(planted.pair(FELT), ideal=replace(FELT, gyro=FELT.gyro + error), band_hz=40.0)
     log = WhitenedLog(pair, Whitener(np.ones((6, 1)), np.array([0.2] * 3 + [0.03] * 3)))
     found = fit([log], planted.acting({"gyro_scale": [0.0] * 3}), part="all")
-    diluted, stated = found.chosen[0][1], scatter([log], found, "all", BLOCK_S).std["gyro_scale"]
+    diluted, stated = found.chosen[0][1], scatter(found).std["gyro_scale"]
     simulated = WhitenedLog(replace(pair, band_hz=None), log.whiten)
-    blocks = scatter([simulated], replace(found, logs=(simulated,)), "all", BLOCK_S).std["gyro_scale"]
+    blocks = scatter(replace(found, logs=(simulated,))).std["gyro_scale"]
     assert (diluted < -5.0 * blocks).all()  # there is no scale
     assert (np.abs(diluted) < 1.5 * stated).all()
 
@@ -120,7 +119,7 @@ def test_a_gain_is_as_likely_as_it_comes_where_noise_lasts() -> None:
         start = planted.acting({"gyro_scale": SCALE, "gyro_quadratic": [0.0] * 3})
         whole, without = fit([log], start, part="all"), fit([log], start[:1], part="all")
         gain = without.objective - whole.objective
-        often["blocks"] += scatter([log], whole, "all", BLOCK_S).log_p_value("gyro_quadratic", gain, 3) < np.log(0.05)
+        often["blocks"] += scatter(whole).log_p_value("gyro_quadratic", gain, 3) < np.log(0.05)
         often["squares"] += gain > 7.81  # chi-square of three, one in twenty
     assert often["blocks"] <= 4  # of sixteen, where one is expected
     assert often["squares"] >= 8
@@ -129,7 +128,7 @@ def test_a_gain_is_as_likely_as_it_comes_where_noise_lasts() -> None:
 def test_a_time_at_which_something_begins_is_taken_as_it_is() -> None:
     log = planted.weighed(planted.pair(FELT, {"clock_jump": [21.3, 0.02]}))
     found = fit([log], planted.acting({"clock_jump": [20.0, 0.01]}), part="all")
-    seen = scatter([log], found, "all", BLOCK_S)
+    seen = scatter(found)
     begins, step = seen.std["clock_jump"]
     assert begins == found.stds()["clock_jump"][0]
     assert abs(found.chosen[0][1][1] - 0.02) < 4.0 * step < 1e-3
@@ -138,7 +137,7 @@ def test_a_time_at_which_something_begins_is_taken_as_it_is() -> None:
 def test_logs_lend_each_other_their_blocks() -> None:
     logs = [planted.weighed(planted.pair(FELT, {"gyro_scale": SCALE}, seed)) for seed in range(2)]
     begun = planted.acting({"gyro_scale": [0.0] * 3})
-    one, both = (scatter(some, fit(some, begun, part="all"), "all", BLOCK_S) for some in (logs[:1], logs))
+    one, both = (scatter(fit(some, begun, part="all")) for some in (logs[:1], logs))
     assert both.blocks["gyro_scale"] > 1.4 * one.blocks["gyro_scale"]
     assert (both.std["gyro_scale"] < one.std["gyro_scale"]).all()
 
@@ -147,7 +146,7 @@ def test_what_the_motion_does_not_show_stays_unsure() -> None:
     felt = planted.planar(60.0)
     log = planted.weighed(planted.pair(felt, {"gyro_scale": [0.0, 0.0, 0.02]}))
     found = fit([log], planted.acting({"gyro_scale": [0.0] * 3}), part="all")
-    std = scatter([log], found, "all", BLOCK_S).std["gyro_scale"]
+    std = scatter(found).std["gyro_scale"]
     assert (std[:2] > 0.1).all()
     assert std[2] < 1e-3
 

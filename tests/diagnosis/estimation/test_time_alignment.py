@@ -356,16 +356,16 @@ def test_channels_come_along_at_the_samples_and_constant_ones_do_not() -> None:
 def test_without_a_simulation_the_motion_itself_is_expected() -> None:
     real, _ = logs()
     felt = planted.rich()
-    pair = with_truth(real, felt, planted.START_NS, 12.0)
+    pair = with_truth(real, replace(felt, t_s=felt.t_s - 1e-9 * (real.imu.t_ns[0] - planted.START_NS)), 12.0)
     assert (left(pair).std(axis=0) < SLACK * planted.NOISE).all()
     assert pair.band_hz == 12.0
     assert pair.aligned_s == 0.0
 
 
 def test_true_poses_of_another_time_are_refused() -> None:
-    real, _ = logs()
+    (real, _), felt = logs(), planted.rich()
     with pytest.raises(DataError, match="shared with the true poses"):
-        with_truth(real, planted.rich(), planted.START_NS + YEAR_NS, 12.0)
+        with_truth(real, replace(felt, t_s=felt.t_s + 1e-9 * YEAR_NS), 12.0)
 
 
 # ── what is fitted and what is held out ──

@@ -12,7 +12,6 @@ from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.observability import beyond_the_band
-from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.physics_file import Entry, PhysicsFile, Value
 
 N = 2400
@@ -262,7 +261,7 @@ def test_a_soft_limit_is_one_that_readings_pass_by_no_more_than_noise() -> None:
     in_g = replace(one, real=there / 9.81)
     for pair, gyro_limit, is_answer in ((noisy, limit, True), (in_g, 0.3 * np.abs(in_g.real[:, :3]).max(), False)):
         gyro, *_ = timestamps.soft_limits([pair], [np.zeros(6)])
-        assert beyond_the_band(gyro, np.array([gyro_limit]), [planted.weighed(pair)], SearchSettings()) is not is_answer
+        assert beyond_the_band(gyro, np.array([gyro_limit]), [planted.weighed(pair)]) is not is_answer
 
 
 def test_a_limit_is_found_though_the_sensor_corrects_its_bias_behind_it() -> None:

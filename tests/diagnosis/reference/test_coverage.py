@@ -204,7 +204,7 @@ def test_a_simulation_that_is_the_recording_itself_differs_by_what_was_added_to_
     (digits,) = timestamps.rounded([pair], np.zeros(6))
     assert is_of_simulation(digits, [pair])
     assert not is_of_simulation(digits, [replace(pair, sim_lsb=pair.sim_lsb / 2.0)])
-    white = whitened(pair, candidates_for([pair]), DiagnoseSettings().band).whiten
+    white = whitened(pair, candidates_for([pair])).whiten
     assert white.std == pytest.approx(lsb / np.sqrt(12.0), rel=0.2)
 
 

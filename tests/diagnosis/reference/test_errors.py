@@ -48,8 +48,8 @@ def found(slow: float, fast: float) -> list[Finding]:
     samples = planted.ideal(felt) + planted.noise(len(felt.t_s), 1) + planted.BIAS
     log = planted.recording("log", felt.t_s, samples, poses=poses)
     mount = catalogue.diagnosed(["mount_rotation"])
-    logs = [whitened(pair, mount, SETTINGS.band) for pair in align(log, None, None, SETTINGS)]
-    return turned_reference(logs, (), SETTINGS.reference)
+    logs = [whitened(pair, mount) for pair in align(log, None, None, SETTINGS)]
+    return turned_reference(logs, ())
 
 
 SMOOTHED_S = 0.015
@@ -94,7 +94,7 @@ def test_a_blow_is_no_error_of_the_reference_and_a_jump_or_a_lost_motion_of_it_i
         lost = np.any([(felt.t_s >= at) & (felt.t_s < at + 2.0) for at in BLOWS_S], axis=0)
         gyro, accel = (np.where(lost[:, None], x.mean(axis=0), x) for x in (felt.gyro, felt.accel))
         pair = replace(pair, ideal=replace(felt, gyro=gyro, accel=accel))
-    findings, places = reference_errors([planted.weighed(pair)], SETTINGS.reference)
+    findings, places = reference_errors([planted.weighed(pair)])
     assert [one.effect for one in findings] == ([] if shaken == "recording" else ["reference_error"])
     assert [one.signal for one in places] == ["gyro", "accel"]
     assert ("shocks" in places[0].regime) == (shaken == "recording")
@@ -128,7 +128,7 @@ def test_a_line_that_the_poses_have_is_no_vibration_of_the_sensor(in_poses: floa
     accel = real.imu.accel + in_samples * attitude.apply(line, inverse=True)
     poses = replace(real.truth, p_wb=real.truth.p_wb + in_poses * shaken)
     real = replace(real, imu=replace(real.imu, accel=accel), truths={"/pose": poses})
-    logs = [whitened(pair, candidates_for([pair]), SETTINGS.band) for pair in align(real, None, None, SETTINGS)]
+    logs = [whitened(pair, candidates_for([pair])) for pair in align(real, None, None, SETTINGS)]
     found = vibration_above_band(logs, ())
     assert [one.effect for one in found] == (["vibration"] if named else [])
     assert all(one.parameters["f"].value == pytest.approx(LINE_HZ, abs=0.01) for one in found)

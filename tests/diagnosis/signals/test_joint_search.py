@@ -91,7 +91,7 @@ def test_an_arm_is_searched_for_two_effects_a_joint_and_not_beyond_the_error_of_
 
 
 def test_friction_may_be_more_than_all_that_the_simulation_needs() -> None:
-    scale = aligned(pair(friction=20.0), {}, DiagnoseSettings()).scale()
+    scale = aligned(pair(friction=20.0), {}, DiagnoseSettings()).scale
     assert min(scale.size) > 10.0
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from support.evo import statistics
 
 from imutool.errors import DataError
-from imutool.inertial.metrics import write_tum
+from imutool.exporting.tum import write_tum
 from imutool.inertial.strapdown import StartPose, along_truth, dead_reckon
 from imutool.recording import Imu, Poses, Recording
 from imutool.viewing.model.trajectory_error import ALIGNMENTS, Alignment, aligned, drift_since_reset, errors, windows

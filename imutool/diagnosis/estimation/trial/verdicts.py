@@ -56,11 +56,15 @@ class Trial:
     named: tuple[Effect, ...]
     unnamed: tuple[Effect, ...]
     always: Chosen
-    settings: SearchSettings
     progress: Callable[[str], None]
     candidates: Candidates
     onset_std: dict[tuple[str, int], float] = field(default_factory=dict, init=False)
     walk_std: Mapping[str, Theta] = field(default_factory=dict, init=False)
+
+    @property
+    def settings(self) -> SearchSettings:
+        """Settings of the search."""
+        return self.logs[0].pair.settings.search
 
     @property
     def tried(self) -> int:
@@ -83,7 +87,7 @@ class Trial:
                 base = fit(base.logs, reduced)
                 unseen.end()
                 continue
-            whole, self.onset_std = estimate_onsets(base.logs, whole, "all", max(1.0, whole.reduced_chi_square))
+            whole, self.onset_std = estimate_onsets(whole)
             self.walk_std = std_of_unseen_walk(whole)
             verdicts = self.verdicts(whole, first, unseen)
             unseen.end()
@@ -135,7 +139,7 @@ class Trial:
         exact, verdicts = all(log.pair.exact for log in self.logs), list[SelectedEffect]()
         white = exact and whole.objective < self.settings.white_chi_square * whole.numbers  # as the noise that is known
         white = white and bool((kurtosis(whole) < self.settings.white_kurtosis).all())  # few samples may hold all squares
-        scattered = None if white else scatter(whole.logs, whole, whole.part, self.settings.robust_block_s)
+        scattered = None if white else scatter(whole)
         if self._verdict(first, gain_of(whole, first, 1), whole, scattered) is None:  # no fit of the others leaves more
             return verdicts
         passed = range(first, unseen.result())
@@ -203,7 +207,7 @@ class Trial:
         std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(stds)])
         if effect.lagless is not None:
             std[0] = np.hypot(std[0], theta[0] * Design.of(effect, theta).digital_share)
-        no_answer = beyond_the_band(effect, theta, self.logs, self.settings) or takes_noise(effect, theta, self.logs)
+        no_answer = beyond_the_band(effect, theta, self.logs) or takes_noise(effect, theta, self.logs)
         no_answer = (
             no_answer
             or is_coloured_noise(effect, theta, whole)

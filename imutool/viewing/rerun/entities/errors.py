@@ -82,12 +82,10 @@ def log_events(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
     for kind in event_kinds(data):
         of_kind = sorted((event for event in data.events if event.kind == kind), key=lambda event: event.start_ns)
         entity = sdk.entity_path(scope, "events", kind)
-        to.log(
-            entity, styles.state_style(kind.replace("_", " "), EVENT_COLORS.get(kind, EVENT_COLOR)), static=True, strict=True
-        )
+        style = styles.state_style(kind.replace("_", " "), EVENT_COLORS.get(kind, EVENT_COLOR))
         times, states = styles.state_changes(_visible_intervals(of_kind, data), data.start_ns)
-        changes = rr.StateChange.columns(state=states)
-        to.send_columns(entity, sdk.data_times(data, np.array(times, dtype=np.int64)), changes, strict=True)
+        at = sdk.data_times(data, np.array(times, dtype=np.int64))
+        sdk.log_columns(to, entity, style, at, rr.StateChange.columns(state=states))
         level = "INFO" if kind == "stop" else "WARN"
         texts = rr.TextLog.columns(text=[event.text for event in of_kind], level=[level] * len(of_kind))
         stamps = np.array([event.start_ns for event in of_kind], dtype=np.int64)

@@ -9,7 +9,8 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.recording import Poses, nanoseconds
-from imutool.viewing.model.run_data import TRUTH, Rows, RunData, Trace, path_rows, round_up_125, split_at_gaps
+from imutool.viewing.model.decimation import Rows, path_rows
+from imutool.viewing.model.run_data import TRUTH, RunData, Trace, round_up_125, split_at_gaps
 from imutool.viewing.model.trajectory_error import Errors, row_of_largest
 from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.entities import styles
@@ -60,7 +61,7 @@ def path_pieces(poses: Poses) -> Pieces:
 
 def log_paths(data: RunData, to: rr.RecordingStream, scope: Scope, size: float) -> None:
     """Log world, paths and bodies of one log; `size` is the diagonal of the scene, m."""
-    to.log(sdk.entity_path(scope, "world"), rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
+    sdk.log_static(to, sdk.entity_path(scope, "world"), rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     if data.truth is not None and len(data.truth):
         _log_path(to, data, sdk.entity_path(scope, "world", "gt"), data.truth, None, "gt", TRUTH_COLOR)
         _log_body(
@@ -109,9 +110,9 @@ def _log_path(
     if by_error is not None:
         error, top = by_error
         colors = heat_colors(_largest(error, cut), top)
-    to.log(f"{entity}/path", styles.path_style(role, None if colors is not None else color), static=True, strict=True)
     columns = rr.LineStrips3D.columns(strips=strips, colors=colors).partition(cut.counts)
-    to.send_columns(f"{entity}/path", sdk.data_times(data, cut.stamp_ns), columns, strict=True)
+    style = styles.path_style(role, None if colors is not None else color)
+    sdk.log_columns(to, f"{entity}/path", style, sdk.data_times(data, cut.stamp_ns), columns)
 
 
 def _largest(error: Float64[np.ndarray, " n"], cut: Pieces) -> Float64[np.ndarray, " m"]:
@@ -125,7 +126,7 @@ def _largest(error: Float64[np.ndarray, " n"], cut: Pieces) -> Float64[np.ndarra
 def _log_body(to: rr.RecordingStream, data: RunData, entity: str, path: Poses, style: list[rr.AsComponents]) -> None:
     """Poses over time, and the style of the body."""
     rows = path_rows(path.p_wb)
-    to.log(f"{entity}/body", *style, static=True, strict=True)
+    sdk.log_static(to, f"{entity}/body", *style)
     columns = rr.Transform3D.columns(translation=path.p_wb[rows], quaternion=path.q_wb_wxyz[rows][:, Q_XYZW])
     to.send_columns(f"{entity}/body", sdk.data_times(data, path.t_ns[rows]), columns, strict=True)
 
@@ -145,9 +146,8 @@ def _log_error_vectors(to: rr.RecordingStream, data: RunData, trace: Trace, erro
     estimated = trace.path.p_wb[rows]
     strips = np.stack([estimated - errors.position_m[rows], estimated], axis=1)
     style = rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points([ERROR_RADIUS]), colors=[WORST_COLOR])
-    to.log(entity, style, static=True, strict=True)
-    columns = rr.LineStrips3D.columns(strips=strips)
-    to.send_columns(entity, sdk.data_times(data, trace.path.t_ns[rows]), columns, strict=True)
+    times = sdk.data_times(data, trace.path.t_ns[rows])
+    sdk.log_columns(to, entity, style, times, rr.LineStrips3D.columns(strips=strips))
 
 
 def _log_worst(to: rr.RecordingStream, data: RunData, trace: Trace, entity: str, size: float) -> None:
@@ -167,7 +167,7 @@ def _log_worst(to: rr.RecordingStream, data: RunData, trace: Trace, entity: str,
     pole = rr.LineStrips3D([[foot, top]], colors=[WORST_COLOR], radii=rr.Radius.ui_points(1.0))
     radii = rr.Radius.ui_points([WORST_RADIUS, 0.0])
     dots = rr.Points3D([foot, top], labels=["", words], colors=[WORST_COLOR, INK], radii=radii, show_labels=True)
-    to.log(f"{entity}/worst", pole, dots, static=True, strict=True)
+    sdk.log_static(to, f"{entity}/worst", pole, dots)
 
 
 def _log_legend(to: rr.RecordingStream, scope: Scope, top: float) -> None:
@@ -175,9 +175,9 @@ def _log_legend(to: rr.RecordingStream, scope: Scope, top: float) -> None:
     strips = [[[left, 0.0], [right, 0.0]] for left, right in pairwise(np.linspace(0.0, LEGEND_WIDTH, LEGEND_STEPS + 1))]
     shares = (np.arange(LEGEND_STEPS) + 0.5) / LEGEND_STEPS
     bar = rr.LineStrips2D(strips, colors=heat_colors(shares, 1.0), radii=rr.Radius.ui_points(6.0))
-    to.log(sdk.entity_path(scope, "legend", "colors"), bar, static=True, strict=True)
+    sdk.log_static(to, sdk.entity_path(scope, "legend", "colors"), bar)
     ticks = np.linspace(0.0, 1.0, LEGEND_TICKS)
     words = [f"{share * top:g}°" for share in ticks] + [LEGEND_TITLE]
     places = [[share * LEGEND_WIDTH, 1.0] for share in ticks] + [[LEGEND_X[0] / 2.0, -2.5]]
     dots = rr.Points2D(places, labels=words, colors=[INK] * len(words), radii=rr.Radius.ui_points(0.0), show_labels=True)
-    to.log(sdk.entity_path(scope, "legend", "ticks"), dots, static=True, strict=True)
+    sdk.log_static(to, sdk.entity_path(scope, "legend", "ticks"), dots)

@@ -18,12 +18,12 @@ MAX_EVENTS = 40  # in the list; the Events tab shows all
 def log_report(data: RunData, to: rr.RecordingStream, scope: Scope, more: Sequence[str]) -> None:
     """Log the text of `markdown` as `report`."""
     text = rr.TextDocument(markdown(data, more), media_type="text/markdown")
-    to.log(sdk.entity_path(scope, "report"), text, static=True, strict=True)
+    sdk.log_static(to, sdk.entity_path(scope, "report"), text)
 
 
 def log_comparison(logs: Sequence[RunData], to: rr.RecordingStream) -> None:
     """Log a table of the figures of several logs as `compare`."""
-    to.log("compare", rr.TextDocument(comparison(logs), media_type="text/markdown"), static=True, strict=True)
+    sdk.log_static(to, "compare", rr.TextDocument(comparison(logs), media_type="text/markdown"))
 
 
 def markdown(data: RunData, more: Sequence[str]) -> str:

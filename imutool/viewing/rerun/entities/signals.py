@@ -10,7 +10,8 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.recording import Times
 from imutool.units import AXES, SENSORS
-from imutool.viewing.model.run_data import MAX_CURVE_ROWS, RunData, Trace, curve_rows, gap_rows
+from imutool.viewing.model.decimation import MAX_CURVE_ROWS, curve_rows
+from imutool.viewing.model.run_data import RunData, Trace, gap_rows
 from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.entities import styles
 from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, GRID, INK, RAW_FADE, XYZ, axis_colors, blend_to_grey
@@ -90,12 +91,10 @@ def log_curves(
 
     A row of NaN in the middle of a gap breaks the line: Rerun's straight one would pass for samples.
     """
-    to.log(entity, style, static=True, strict=True)
     rows, gaps = curve_rows(values, MAX_DERIVED_ROWS if max_rows is None else max_rows), gap_rows(t_ns)
     middle_ns, at = t_ns[gaps - 1] + (t_ns[gaps] - t_ns[gaps - 1]) // 2, np.searchsorted(rows, gaps)
     t_ns, values = np.insert(t_ns[rows], at, middle_ns), np.insert(values[rows], at, np.nan, axis=0)
-    # strict: Rerun only warns of a length that does not match, and then the rows are missing
-    to.send_columns(entity, sdk.data_times(data, t_ns), rr.Scalars.columns(scalars=values), strict=True)
+    sdk.log_columns(to, entity, style, sdk.data_times(data, t_ns), rr.Scalars.columns(scalars=values))
 
 
 def decimation_note(data: RunData) -> list[str]:
@@ -166,7 +165,7 @@ def _log_spectrum(data: RunData, to: rr.RecordingStream, entity: str, trace: Tra
     colors = [blend_to_grey(color, RAW_FADE) for color in XYZ] if pale else axis_colors(model_index(data, trace))
     radius = 0.9 * BOLD_WIDTH if pale else BOLD_WIDTH / 2.0  # where both curves agree, raw is the rim
     lines = rr.LineStrips2D(strips, colors=colors, radii=rr.Radius.ui_points(radius), draw_order=1.0 if pale else 2.0)
-    to.log(entity, lines, static=True, strict=True)
+    sdk.log_static(to, entity, lines)
 
 
 def _log_frame(to: rr.RecordingStream, entity: str, frame: DecadeFrame) -> None:
@@ -176,7 +175,7 @@ def _log_frame(to: rr.RecordingStream, entity: str, frame: DecadeFrame) -> None:
     x = (across - frame.low_hz) / (frame.high_hz - frame.low_hz) * WIDTH
     y = HEIGHT - (up - frame.low) / (frame.high - frame.low) * HEIGHT
     lines = [[[at, 0.0], [at, HEIGHT]] for at in x] + [[[0.0, at], [WIDTH, at]] for at in y]
-    to.log(entity, rr.LineStrips2D(lines, colors=[GRID] * len(lines), radii=rr.Radius.ui_points(0.5)), static=True, strict=True)
+    sdk.log_static(to, entity, rr.LineStrips2D(lines, colors=[GRID] * len(lines), radii=rr.Radius.ui_points(0.5)))
     _log_labels(to, f"{entity}/hz", [[at, HEIGHT + 4.0] for at in x], [f"{_power(power)} Hz" for power in across.tolist()])
     _log_labels(to, f"{entity}/density", [[-11.0, at - 5.5] for at in y], [_power(power) for power in up.tolist()])
 
@@ -184,7 +183,7 @@ def _log_frame(to: rr.RecordingStream, entity: str, frame: DecadeFrame) -> None:
 def _log_labels(to: rr.RecordingStream, entity: str, positions: Sequence[Sequence[float]], labels: Sequence[str]) -> None:
     dots = rr.Radius.ui_points(0.0)
     text = rr.Points2D(positions, labels=list(labels), colors=[INK] * len(labels), radii=dots, show_labels=True)
-    to.log(entity, text, static=True, strict=True)
+    sdk.log_static(to, entity, text)
 
 
 def _power(power: int) -> str:

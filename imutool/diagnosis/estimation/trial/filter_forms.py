@@ -15,7 +15,6 @@ from imutool.diagnosis.estimation.observability import LOW_PASSES, beyond_the_ba
 from imutool.diagnosis.estimation.significance import bic
 from imutool.diagnosis.estimation.trial.effect_forms import digital, exponential
 from imutool.diagnosis.estimation.whitening import WhitenedLog
-from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.effects.low_pass import RATE, SMOOTHING, Design
 from imutool.sensor.effects.second_order_low_pass import BUTTERWORTH
@@ -50,17 +49,17 @@ def lag_taken_back(others: Chosen, effect: Effect, start: Theta) -> list[Chosen]
     return [(*others[:place], (offset, tau_s + np.array([lag_s])), *others[place + 1 :], (effect, start))]
 
 
-def without_unseen_low_pass(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect], settings: SearchSettings) -> Fit:
+def without_unseen_low_pass(base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with a clock offset for a low pass beyond the poses' band, which its delay shows."""
     offset = next((e for e in named if e.name == "clock_offset" and e.key not in base.keys), None)
     for k, (effect, theta) in enumerate(base.chosen):
-        if offset is not None and effect.name in LOW_PASSES and beyond_the_band(effect, theta, logs, settings):
+        if offset is not None and effect.name in LOW_PASSES and beyond_the_band(effect, theta, base.logs):
             delayed = offset, np.array([-Design.of(effect, theta).lag_s])  # far below its cut-off
-            return fit(logs, (*base.chosen[:k], *base.chosen[k + 1 :], delayed), near=base)
+            return fit(base.logs, (*base.chosen[:k], *base.chosen[k + 1 :], delayed), near=base)
     return base
 
 
-def with_form_of_low_pass(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect]) -> Fit:
+def with_form_of_low_pass(base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with another form of a low-pass that is clearly better (BIC).
 
     Forms are its order, a digital filter, and filters of one sensor or of each by itself.
@@ -68,7 +67,7 @@ def with_form_of_low_pass(logs: Sequence[WhitenedLog], base: Fit, named: Sequenc
     of another form would leave its error to other effects. Poses do not know so fast a motion. Where the simulation itself errs
     (its noise was filtered, it folds vibrations), a filter of other sensors has to explain more than that.
     """
-    if not all(isinstance(log.pair, Pair) and log.pair.exact for log in logs):
+    if not _is_simulated(logs := base.logs):
         return base
     settings, period_s = logs[0].pair.settings.search, logs[0].pair.period_s
     error = _model_error(logs)
@@ -82,30 +81,30 @@ def with_form_of_low_pass(logs: Sequence[WhitenedLog], base: Fit, named: Sequenc
             if _form_bic(trial) < _form_bic(best) and bic(trial) < bic(base) - margin and not _folds(trial, period_s):
                 best = trial
         if best is not base:
-            return with_form_of_low_pass(logs, best, named)
+            return with_form_of_low_pass(best, named)
         two = _of_each_sensor(base, k, named)
         trial = fit(logs, two, near=base) if two else base
         if bic(trial) < bic(base) - settings.model_error_low_pass / error * max(settings.clearly_better, errs):
             for sensor in SENSORS:  # a second order that only fits with an endless damping is a first one
-                trial = _with_own_form(logs, trial, (sensor,), named)
-            return with_form_of_low_pass(logs, trial, named)
+                trial = _with_own_form(trial, (sensor,), named)
+            return with_form_of_low_pass(trial, named)
     return base
 
 
-def with_form_of_resonance(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect]) -> Fit:
+def with_form_of_resonance(base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with a resonance whose damper is elsewhere, where that is clearly better (BIC)."""
-    if not all(log.pair.exact for log in logs):
+    if not all(log.pair.exact for log in base.logs):
         return base
     for k, (effect, theta) in enumerate(base.chosen):
         for other in [e for e in named if e.name == effect.name == "mount_resonance" and e.key != effect.key]:
             chosen = (*base.chosen[:k], (other, theta), *base.chosen[k + 1 :])
-            trial = fit(logs, chosen, near=base, give_up_above=base.objective)
-            if bic(trial) < bic(base) - logs[0].pair.settings.search.clearly_better:
+            trial = fit(base.logs, chosen, near=base, give_up_above=base.objective)
+            if bic(trial) < bic(base) - base.logs[0].pair.settings.search.clearly_better:
                 return trial
     return base
 
 
-def with_delay_of_accel(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect]) -> Fit:
+def with_delay_of_accel(base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with a delay of the accelerometer for a clearly worse filter of it (BIC).
 
     A late accelerometer is a clock that is late, and a gyro that is ahead of it. One alone of these two explains little, so
@@ -116,22 +115,22 @@ def with_delay_of_accel(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[
         if len(both) == 2 and effect.name in (*LOW_PASSES, HYSTERESIS) and effect.sensors == ("accel",):
             start = np.array([0.0 if effect.name == HYSTERESIS else -Design.of(effect, theta).lag_s])
             late = (*base.chosen[:k], *base.chosen[k + 1 :], *((of, start) for of in both))
-            settings = logs[0].pair.settings.search
-            trial = fit(logs, late, near=base, give_up_above=base.objective)
+            settings = base.logs[0].pair.settings.search
+            trial = fit(base.logs, late, near=base, give_up_above=base.objective)
             if bic(trial) >= bic(base) - settings.clearly_better:
                 return base
-            maximum = settings.hysteresis_leaves * (fit(logs, late[:-2], near=base).objective - trial.objective)
+            maximum = settings.hysteresis_leaves * (fit(base.logs, late[:-2], near=base).objective - trial.objective)
             return base if effect.name == HYSTERESIS and leaves_slow_motion(trial, "accel", maximum) else trial
     return base
 
 
-def with_filter_of_each_sensor(logs: Sequence[WhitenedLog], base: Fit, named: Sequence[Effect]) -> Fit:
+def with_filter_of_each_sensor(base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with a low-pass of each sensor for lags of both, in its own form, if better (BIC).
 
     Chips filter gyro and accelerometer each in its own way. The search finds the larger filter on both sensors, and then a
     clock, or a gyro, that takes some of the lag back.
     """
-    if not all(isinstance(log.pair, Pair) and log.pair.exact for log in logs):
+    if not _is_simulated(logs := base.logs):
         return base
     lags = [k for k, (effect, _) in enumerate(base.chosen) if effect.name in LAGS]
     if not {base.chosen[k][0].name for k in lags} - {"clock_offset"} or (
@@ -153,7 +152,7 @@ def with_filter_of_each_sensor(logs: Sequence[WhitenedLog], base: Fit, named: Se
 
     best = beside(early_s, *((of, np.array([-early_s])) for of in clocks if early_s))
     for of in second:
-        best = _with_own_form(logs, best, of.sensors, named)
+        best = _with_own_form(best, of.sensors, named)
     if early_s:  # with a filter in its place neither answer is the plainer one
         slack = logs[0].pair.settings.search.clearly_better if len(lags) > 1 else 0.0
         return best if _form_bic(best) < _form_bic(base) + slack else base
@@ -167,19 +166,24 @@ def with_filter_of_each_sensor(logs: Sequence[WhitenedLog], base: Fit, named: Se
     return best if _form_bic(best) < _form_bic(base) - max(margin, errs) else base
 
 
+def _is_simulated(logs: Sequence[WhitenedLog]) -> bool:
+    """Whether all logs are of an IMU and compared with a simulation."""
+    return all(isinstance(log.pair, Pair) and log.pair.exact for log in logs)
+
+
 def _model_error(logs: Sequence[WhitenedLog]) -> float:
     """Share of the squares of a filter by which its model may err, against a simulation."""
     settings = logs[0].pair.settings.search
     return settings.model_error_denoised if any(log.pair.denoised for log in logs) else settings.model_error
 
 
-def _with_own_form(logs: Sequence[WhitenedLog], base: Fit, sensors: tuple[str, ...], named: Sequence[Effect]) -> Fit:
+def _with_own_form(base: Fit, sensors: tuple[str, ...], named: Sequence[Effect]) -> Fit:
     """Fit with the filter of one sensor in another form, if better."""
     k = next(k for k, (effect, _) in enumerate(base.chosen) if effect.name in LOW_PASSES and effect.sensors == sensors)
-    period_s, best = logs[0].pair.period_s, base
+    period_s, best = base.logs[0].pair.period_s, base
     forms = [of for of in named if of.name in LOW_PASSES and of.sensors == sensors]  # the other sensor may have another order
     for chosen in _forms(base, k, forms, 1.0 / period_s):
-        trial = fit(logs, chosen, near=base, give_up_above=bic(best))
+        trial = fit(base.logs, chosen, near=base, give_up_above=bic(best))
         best = trial if _form_bic(trial) < _form_bic(best) and not _folds(trial, period_s) else best
     return best
 
