@@ -137,7 +137,7 @@ def with_plainer_effects(logs: Sequence[WhitenedLog], base: Fit, named: Sequence
     for complex_one, theta in base.chosen:
         sizes = _plainer(complex_one, theta, poses=poses)
         rest = tuple(entry for entry in base.chosen if entry[0] is not complex_one)
-        plainer = [effect for effect in named if effect.name in sizes and effect.key not in base.keys]
+        plainer = [effect for effect in named if effect.key in sizes and effect.key not in base.keys]
         parts = [(with_free(e, sizes[e.name][0], complex_one.sensors), np.array(sizes[e.name][1])) for e in plainer]
         margin = base.logs[0].pair.settings.search.clearly_better * max(1.0, base.reduced_chi_square)
         limits = [bic(base) + margin - parameter_cost(base, (*rest, part)) for part in parts]
@@ -161,7 +161,7 @@ def _plainer(effect: Effect, theta: Theta, *, poses: bool) -> Mapping[str, tuple
         lag_s = low_pass.Design.of(effect, theta).lag_s
         of_both = {"clock_offset": ([0], [-lag_s]), "low_pass": ([0], [1.0 / (2.0 * np.pi * lag_s)])}
         return of_both if len(effect.sensors) > 1 else {"gyro_delay": ([0], [lag_s])} if effect.sensors[0] == "gyro" else {}
-    if name == "gyro_delay" and poses:
+    if effect.key == "gyro_delay" and poses:
         return {"clock_offset": ([0], [-theta[0]])}
     if name in PLAINER and effect.variant != SHARED:
         return {PLAINER[name][0]: (PLAINER[name][1], np.zeros(len(PLAINER[name][1])).tolist())}
