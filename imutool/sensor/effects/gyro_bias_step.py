@@ -75,7 +75,7 @@ def likeliest_onset(
     error: Float64[np.ndarray, "n 3"],
     beside: Float64[np.ndarray, "n q"],
     before: int = 0,
-    setting_in: Sequence[Float64[np.ndarray, "n 3"]] = (),
+    setting_in: Sequence[Float64[np.ndarray, "_ 3"]] = (),
 ) -> Theta:
     """Sizes by axis, then the time, of the onset that explains most of an error.
 

@@ -29,7 +29,7 @@ def scale(sensor: Sensor, symbol: str, plausible: float, observable_if: str) -> 
 
 
 def of_form(effect: Effect, names: Container[str]) -> Effect:
-    """The effect from one time on if `t_step` is among the names and it may set in, any other effect itself."""
+    """Effect from one time on if it may set in and `t_step` is named, any other effect itself."""
     return _from_one_time_on(effect) if effect.name in SETTING_IN and T_STEP.name in names else effect
 
 

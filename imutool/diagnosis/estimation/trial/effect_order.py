@@ -23,11 +23,14 @@ READINGS = frozenset(
     f"{sensor}_{kind}" for sensor in ("gyro", "accel") for kind in ("scale", "misalignment", "scale_asymmetry", "quadratic")
 ) | {"gyro_g_sensitivity"}
 INSTANT = READINGS | {"lever_arm", "size_effect", "mount_rotation"}  # of one instant of the motion: any order is thinkable
-Readings = Float64[np.ndarray, "n k"]
+Readings = Float64[np.ndarray, "_ k"]  # each log has its own rows
 
 
 def order_squares(found: Fit, effect: Effect) -> float:
-    """White squares, on the sensors of an effect, of what the reverse order of all others changes beyond their parameters."""
+    """White squares of what the reverse order of all other effects changes.
+
+    On the sensors of an effect, beyond what the parameters of the others take over.
+    """
     others = tuple(entry for entry in found.chosen if entry[0] is not effect)
     pairs = _pairs(found)
     if not pairs or sum(_is_of(INSTANT, other) for other, _ in others) < 2:
@@ -38,7 +41,10 @@ def order_squares(found: Fit, effect: Effect) -> float:
 
 
 def order_std(found: Fit) -> dict[str, Theta]:
-    """Deviations of the parameters by the order of the effects of readings: reversed, or all added to the true one."""
+    """Standard deviations of the parameters by the order of the effects of readings.
+
+    It is reversed, or each effect is added to the true reading.
+    """
     pairs = _pairs(found)
     if not pairs or sum(_is_of(READINGS, effect) for effect, _ in found.chosen) < 2:
         return {}
