@@ -136,7 +136,7 @@ def with_plainer_effects(base: Fit, named: Sequence[Effect]) -> Fit:
     for complex_one, theta in base.chosen:
         sizes = _plainer(complex_one, theta, poses=poses)
         rest = tuple(entry for entry in base.chosen if entry[0] is not complex_one)
-        plainer = [effect for effect in named if effect.name in sizes and effect.key not in base.keys]
+        plainer = [effect for effect in named if effect.key in sizes and effect.key not in base.keys]
         parts = [(with_free(e, sizes[e.name][0], complex_one.sensors), np.array(sizes[e.name][1])) for e in plainer]
         margin = base.logs[0].pair.settings.search.clearly_better * max(1.0, base.reduced_chi_square)
         limits = [bic(base) + margin - parameter_cost(base, (*rest, part)) for part in parts]
@@ -160,7 +160,7 @@ def _plainer(effect: Effect, theta: Theta, *, poses: bool) -> Mapping[str, tuple
         lag_s = low_pass.Design.of(effect, theta).lag_s
         of_both = {"clock_offset": ([0], [-lag_s]), "low_pass": ([0], [1.0 / (2.0 * np.pi * lag_s)])}
         return of_both if len(effect.sensors) > 1 else {"gyro_delay": ([0], [lag_s])} if effect.sensors[0] == "gyro" else {}
-    if name == "gyro_delay" and poses:
+    if effect.key == "gyro_delay" and poses:
         return {"clock_offset": ([0], [-theta[0]])}
     if name in PLAINER and effect.variant != SHARED:
         return {PLAINER[name][0]: (PLAINER[name][1], np.zeros(len(PLAINER[name][1])).tolist())}
@@ -171,23 +171,27 @@ def _plainer(effect: Effect, theta: Theta, *, poses: bool) -> Mapping[str, tuple
 
 
 def with_common_arm(base: Fit, named: Sequence[Effect], is_significant: Callable[[Effect, float], bool]) -> Fit:
-    """Fit with a lever arm for a size effect of equal arms; with both if the rest is smaller."""
-    arms = [k for k, (effect, _) in enumerate(base.chosen) if effect.name == "size_effect" and len(effect.parameters) == 9]
-    lever = [effect for effect in named if effect.name == "lever_arm" and effect.key not in base.keys]
-    if not arms or not lever:
+    """Fit with a lever arm for a size effect of equal arms; with both if the rest is smaller.
+
+    All nine numbers of a size effect next to a lever arm hold that arm twice, and either could do without the other.
+    """
+    nine = [entry for entry in base.chosen if entry[0].name == "size_effect" and len(entry[0].parameters) == 9]
+    lever = [effect for effect in named if effect.name == "lever_arm"]
+    if not nine or not lever:
         return base
     logs, share = base.logs, base.logs[0].pair.settings.search.common_arm_share
-    others, (size_effect, theta) = (*base.chosen[: arms[0]], *base.chosen[arms[0] + 1 :]), base.chosen[arms[0]]
+    others = tuple(entry for entry in base.chosen if entry[0].name not in ("size_effect", "lever_arm"))
+    alone = base if len(others) == len(base.chosen) - 1 else fit(logs, (*others, nine[0]), near=base)
     without = fit(logs, others, near=base)
     simple = fit(logs, (*others, (lever[0], lever[0].null_value.astype(float))), near=base)
     if without.objective - simple.objective < share * (without.objective - base.objective):
-        return base
-    rest = with_free(size_effect, range(6))  # of the x and y axes against z, whose arm is the lever arm
+        return alone
+    rest = with_free(nine[0][0], range(6))  # of the x and y axes against z, whose arm is the lever arm
     both = fit(logs, (*simple.chosen, (rest, rest.null_value.astype(float))), near=simple)
     if not is_significant(rest, simple.objective - both.objective):
         return simple
-    positions = theta.reshape(3, 3)  # of each axis
-    return both if np.linalg.norm(positions.mean(axis=0)) > np.linalg.norm(positions.std(axis=0)) else base
+    positions = next(theta for effect, theta in alone.chosen if effect is nine[0][0]).reshape(3, 3)  # of each axis
+    return both if np.linalg.norm(positions.mean(axis=0)) > np.linalg.norm(positions.std(axis=0)) else alone
 
 
 def values_of(effect: Effect, reduced: Effect, theta: Theta) -> Theta:

@@ -75,16 +75,16 @@ def likeliest_onset(
     error: Float64[np.ndarray, "n 3"],
     beside: Float64[np.ndarray, "n q"],
     before: int = 0,
-    setting_in: Float64[np.ndarray, "n k"] | None = None,
+    setting_in: Sequence[Float64[np.ndarray, "_ 3"]] = (),
 ) -> Theta:
     """Sizes by axis, then the time, of the onset that explains most of an error.
 
-    A constant sets in, or a column of `setting_in` for each axis, between two samples, together with some columns and so many
-    likelier constants. Each axis counts by what is left there. In least squares a further column gains (left' x)² / x' x, both
-    less their projection on the others (Frisch and Waugh, Econometrica 1933); for all columns that set in at one time these
-    are sums from that time on.
+    A constant sets in, or signals of `setting_in`, between two samples, together with some columns and so many likelier
+    constants. Of several signals an axis has a size for each. Each axis counts by what is left there. In least squares further
+    columns X gain left' X (X' X)^-1 X' left, all less their projection on the others (Frisch and Waugh, Econometrica 1933);
+    for all columns that set in at one time these are sums from that time on.
     """
-    columns = np.ones((len(t_s), 1)) if setting_in is None else setting_in
+    columns = np.stack(setting_in or [np.ones(error.shape)], axis=2)
     basis = orthonormal(beside)
     size, row = _largest(t_s, error, basis, columns)
     for _ in range(before):
@@ -105,17 +105,21 @@ def _largest(
     t_s: Float64[np.ndarray, " n"],
     error: Float64[np.ndarray, "n 3"],
     basis: Float64[np.ndarray, "n q"],
-    columns: Float64[np.ndarray, "n k"],
-) -> tuple[Float64[np.ndarray, "3"], int]:
-    """Size of what explains most by setting in, after orthonormal columns, and the sample before it."""
+    columns: Float64[np.ndarray, "n 3 m"],
+) -> tuple[Theta, int]:
+    """Sizes, axis by axis, of what explains most by setting in, after orthonormal columns, and the sample before it."""
     rest = error - basis @ (basis.T @ error)
-    own = [from_on(x**2) - (from_on(basis * x[:, None]) ** 2).sum(axis=1) for x in columns.T]
-    minimum = np.maximum((columns**2).mean(axis=0), np.finfo(np.float64).tiny)
-    sums = from_on(rest * columns)
-    size = sums / np.maximum(np.stack(own, axis=1), minimum)
-    gain = (sums * size / np.maximum((rest**2).mean(axis=0), np.finfo(np.float64).tiny)).sum(axis=1)
+    sizes, gain = list[Float64[np.ndarray, "n-1 m"]](), np.zeros(len(t_s) - 1)
+    for x, left in zip(columns.transpose(1, 0, 2), rest.T, strict=True):
+        shared = from_on(basis[:, :, None] * x[:, None])
+        N = from_on(x[:, :, None] * x[:, None]) - shared.transpose(0, 2, 1) @ shared
+        each = np.arange(x.shape[1])
+        N[:, each, each] = np.maximum(N[:, each, each], np.maximum((x**2).mean(axis=0), np.finfo(np.float64).tiny))
+        sums = from_on(x * left[:, None])
+        sizes.append(np.linalg.solve(N, sums[..., None])[..., 0])
+        gain += (sums * sizes[-1]).sum(axis=1) / max(float((left**2).mean()), np.finfo(np.float64).tiny)
     row = best_row(t_s, gain)
-    return size[row], row
+    return np.concatenate([size[row] for size in sizes]), row
 
 
 def best_row(t_s: Float64[np.ndarray, " n"], gain: Float64[np.ndarray, " _"]) -> int:

@@ -16,6 +16,7 @@ from imutool.array_types import Complex128, Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
 from imutool.sensor.samples import IdealMotion
 
+MAX_S = 0.3  # of a delay that sets in: slower than any filter of a chip
 NEARLY_WHOLE = 1e-30  # of a sample, where 0 / 0 would be the kernel's own 1
 
 
@@ -73,7 +74,7 @@ EFFECT = Effect(
     Stage.BANDWIDTH,
     ("gyro",),
     "gyro(t) = omega(t - tau)",
-    (Parameter("tau", "s", 0.005),),
+    (Parameter("tau", "s", 0.005, maximum=MAX_S),),
     "it turns, and the accelerometer shows the clock",
     _forward,
     linear=False,

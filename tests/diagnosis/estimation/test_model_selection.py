@@ -191,6 +191,20 @@ def test_a_gyro_that_becomes_late_is_no_jump_of_the_clock() -> None:
     assert "clock_jump" not in names(asked(planted.pair(motion, {}, 3, added=late * from_half_on)))
 
 
+@pytest.mark.parametrize(
+    ("name", "theta"),
+    [("gyro_delay", [0.006]), ("gyro_g_sensitivity", [1e-3, 0.0, 5e-4, 0.0, -1e-3, 0.0, 3e-4, 0.0, 8e-4])],
+)
+def test_an_error_of_the_gyro_that_sets_in_has_its_name_and_time(name: str, theta: list[float]) -> None:
+    """A gyro that became late by 6 ms was a clock that jumped for both sensors; a g-sensitivity had no name."""
+    motion = planted.rich()
+    error = planted.ideal(motion, planted.acting({name: theta})) - planted.ideal(motion)
+    pair = planted.pair(motion, {}, 3, added=error * (motion.t_s >= 13.3)[:, None])
+    (one,) = select_effects([planted.weighed(pair)], tuple(gyro_scale.in_both_forms(planted.catalogue()))).selected
+    assert (one.effect.name, one.effect.parameters[-1].name) == (name, "t_step")
+    assert (np.abs(one.theta - [*theta, 13.3]) < SURE * one.std).all()
+
+
 def several_times(pair: Pair) -> Selection:
     """The catalogue, with what may act more than once."""
     forms = gyro_bias_step.repeated([*gyro_bias_drift.within(planted.catalogue(), float(pair.stamp_s[-1]))])

@@ -110,7 +110,7 @@ def with_delay_of_accel(base: Fit, named: Sequence[Effect]) -> Fit:
     A late accelerometer is a clock that is late, and a gyro that is ahead of it. One alone of these two explains little, so
     that the search finds the low-pass of this lag, or of slow motion a hysteresis.
     """
-    both = [of for name in ("clock_offset", "gyro_delay") for of in named if of.name == name and of.key not in base.keys]
+    both = [of for key in ("clock_offset", "gyro_delay") for of in named if of.key == key and key not in base.keys]
     for k, (effect, theta) in enumerate(base.chosen):
         if len(both) == 2 and effect.name in (*LOW_PASSES, HYSTERESIS) and effect.sensors == ("accel",):
             start = np.array([0.0 if effect.name == HYSTERESIS else -Design.of(effect, theta).lag_s])
@@ -212,7 +212,7 @@ def _lag_s(effect: Effect, theta: Theta, sensor: str) -> float:
     """Lag of one sensor far below any cut-off."""
     if effect.name in LOW_PASSES:
         return Design.of(effect, theta).lag_s if sensor in effect.sensors else 0.0
-    if effect.name == "gyro_delay":
+    if effect.key == "gyro_delay":
         return float(theta[0]) if sensor == "gyro" else 0.0
     return -float(theta[0]) if effect.name == "clock_offset" else 0.0
 

@@ -22,6 +22,7 @@ from imutool.diagnosis.estimation.significance import (
     with_onsets_of,
     with_onsets_of_all_rows,
 )
+from imutool.diagnosis.estimation.trial.effect_order import order_squares, order_std
 from imutool.diagnosis.estimation.trial.model_error import (
     FOLLOWING,
     LowPassError,
@@ -60,6 +61,7 @@ class Trial:
     candidates: Candidates
     onset_std: dict[tuple[str, int], float] = field(default_factory=dict, init=False)
     walk_std: Mapping[str, Theta] = field(default_factory=dict, init=False)
+    order_std: Mapping[str, Theta] = field(default_factory=dict, init=False)
 
     @property
     def settings(self) -> SearchSettings:
@@ -88,7 +90,7 @@ class Trial:
                 unseen.end()
                 continue
             whole, self.onset_std = estimate_onsets(whole)
-            self.walk_std = std_of_unseen_walk(whole)
+            self.walk_std, self.order_std = std_of_unseen_walk(whole), order_std(whole)
             verdicts = self.verdicts(whole, first, unseen)
             unseen.end()
             rates = [*(verdict.false_discovery_rate for verdict in verdicts), 1.0][: len(base.chosen) - first]
@@ -168,6 +170,7 @@ class Trial:
         below |= {e.effect.key for e in verdicts if below_reference_error(e.effect, e.gain, whole)}
         below |= {e.effect.key for e in verdicts if exact and is_part_of_misfit(e.effect, e.gain, whole)}
         below |= {e.effect.key for e in verdicts if self._is_contradicted(e.effect, whole)}
+        below |= {e.effect.key for e in verdicts if e.gain < order_squares(whole, e.effect)}
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in below else verdict for verdict in verdicts]
 
     def _shown_elsewhere(self, key: str, gains: Mapping[str, float], whole: Fit) -> bool:
@@ -226,7 +229,7 @@ class Trial:
         if scattered is not None:
             log_p = max(log_p, scattered.log_p_value(effect.key, gain[1], len(theta)) + self.candidates.log_choices[effect.key])
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
-        std = np.hypot(std, self.walk_std.get(effect.key, 0.0))
+        std = np.hypot(np.hypot(std, self.walk_std.get(effect.key, 0.0)), self.order_std.get(effect.key, 0.0))
         vague = tuple(unidentified(effect, theta, std, curve=curve))
         return SelectedEffect(effect, theta, std, vague, float(np.exp(max(log_p, -700))), rate, gain[0]) if rate < 1.0 else None
 
