@@ -6,8 +6,8 @@ DATA holds the data sets as their authors ship them: DATA/euroc, DATA/tumvi, DAT
 the defaults, the split is the paper's, the test sequences are read when a model is done. What is there already (logs, models,
 figures) is not made again, so that an interrupted run goes on. `--swap` trains on the test sequences and tests on the training
 ones, which nobody tuned for. `paper` is the neural ODE trained as the paper describes it, the gyro alone: its accelerometer
-takes twice as long. Its start is its own, which its field forgets, so that it stands next to `start: truth` alone. `conv` is the
-network itself, as published: by default training keeps it only where left-out logs confirm it.
+takes twice as long. Its start is its own, which its field forgets, so that it stands next to `start: truth` alone. `conv` is
+the network itself, as published: by default training keeps it only where left-out logs confirm it.
 """
 
 from __future__ import annotations
