@@ -63,7 +63,8 @@ def card(name: str, about: dict[str, Any], rows: list[dict[str, Any]], seeds: in
         "",
         f"- Trained on {', '.join(logs)}: the first 80 % of each log. The last 20 % chose between the end of the descent "
         f"and its closed-form start, and one of {seeds} seed(s).",
-        f"- Settings: the defaults of imutool {about['imutool']}{whole and ' but `compare`'}, torch {about['torch']}, seed {seed}.",
+        f"- Settings: the defaults of imutool {about['imutool']}{whole and ' but `compare`'}, torch {about['torch']}, "
+        f"seed {seed}.",
         f"- Command: `{command}`",
         f"- Held out: {about['held_out']['gyro']['error'] * 180 / np.pi:.3f}° (gyro, windows of up to 20 s), "
         f"{about['held_out']['accel']['error']:.3f} m/s (accelerometer, 5 s), with each log's constant solved for.",
