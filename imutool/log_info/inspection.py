@@ -245,6 +245,7 @@ def _imu_warnings(imu: ImuSamples) -> list[str]:
         "saturated": "saturated",
     }
     warnings = [f"{n} sample{'s' * (n != 1)} {text}" for key, text in words.items() if (n := imu.counts[key])]
+    warnings += imu.unreadable
     if imu.unsorted:
         warnings.append("the messages are not in order of their log time; imutool convert LOG OUT puts them in order")
     warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in imu.stamps.faults]
