@@ -110,7 +110,7 @@ class Topic:
                     raise
                 unreadable(error.what)
                 _, log_time, publish_time, sequence, _ = rows.where(slice(1))
-                yield ImuBatch(log_time, publish_time, sequence, log_time, *np.full((2, 1, 3), np.nan), "")
+                yield ImuBatch(log_time, publish_time, sequence, log_time, nan := np.full((1, 3), np.nan), nan, "")
                 rows = rows.where(slice(1, None))
 
     def vectors(self, rows: Rows, sensor: str) -> Iterator[Vectors]:

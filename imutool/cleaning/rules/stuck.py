@@ -123,7 +123,7 @@ class _StillGyro:
         samples = around.where(core)
         still = self._still(around.values[:, :3], steps)[core]
         for first, end in true_ranges(still):
-            numbers, stamps_ns = (tuple(map(int, column[[first, end - 1]])) for column in (samples.number, samples.stamp_ns))
+            numbers, stamps_ns = ((int(x[first]), int(x[end - 1])) for x in (samples.number, samples.stamp_ns))
             low, high = (extreme(samples.values[first:end, :3], axis=0) for extreme in (np.min, np.max))
             if first == 0 and self._goes_on:
                 run = self._runs.pop()
@@ -135,7 +135,7 @@ class _StillGyro:
     def _still(self, gyro: Float64[np.ndarray, "n 3"], steps: Float64[np.ndarray, "m 3"]) -> Bool[np.ndarray, " n"]:
         """Samples in `AXIS_MIN` within one count."""
         still = np.zeros(len(gyro), bool)
-        for first, end in true_ranges((steps <= WITHIN * self._count).all(axis=1)):
+        for first, end in true_ranges(np.asarray((steps <= WITHIN * self._count).all(axis=1))):
             if end - first >= AXIS_MIN - 1:
                 windows = sliding_window_view(gyro[first : end + 1], AXIS_MIN, axis=0)
                 for k in np.flatnonzero((np.ptp(windows, axis=2) <= WITHIN * self._count).all(axis=1)):
