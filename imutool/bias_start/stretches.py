@@ -108,7 +108,7 @@ def measured_imu(imu: Imu, where: str, *, free_fall: bool = False) -> Imu:
 
 
 def measured_recording(recording: Recording, *, free_fall: bool = False) -> Recording:
-    """A recording without the IMU samples that are no measurement, or of a sensor that was stuck."""
+    """A recording without the IMU samples that are no measurement, or of a stuck sensor."""
     imu = measured_imu(recording.imu, recording.name, free_fall=free_fall)
     u = np.concatenate([imu.gyro, imu.accel], axis=1)
     repeats, failed = repeated(u), failed_gyro(imu.t_ns, u)

@@ -1,4 +1,4 @@
-"""Stuck values: a sensor that repeats its last sample, an axis that does not change, a gyro within one count.
+"""Stuck values: repeated samples, an axis without changes, a gyro within one count.
 
 A sensor with noise does not give six equal numbers twice; in 23 real recordings two samples in a row are the longest such
 run. In a noise-free simulation at rest it does, so repeats are only dropped where the samples that do change show noise:
