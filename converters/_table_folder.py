@@ -21,6 +21,7 @@ from imutool.errors import DataError
 
 from . import Sequence
 from ._archive import refusing
+from ._dataflash_messages import TEXT_START
 from ._source import find_folders, head
 from ._table_files import NO_NUMBERS, kind_of, load
 from ._table_geodetic import add_local
@@ -42,24 +43,8 @@ MAX_TABLES = 40  # of one recording
 MAX_NAMED = 5  # of tables that are left out
 DATA_FILE = "data.hdf5"  # of RoNIN
 logger = logging.getLogger(__package__)  # whose records `_unpacking` renames
-ENDINGS = (
-    ".csv",
-    ".txt",
-    ".tsv",
-    ".dat",
-    ".tum",
-    ".json",
-    ".mat",
-    ".npz",
-    ".npy",
-    ".parquet",
-    ".feather",
-    ".arrow",
-    ".h5",
-    ".hdf5",
-    ".xlsx",
-    ".xls",
-)
+TEXTS = ".csv", ".txt", ".tsv", ".dat", ".log", ".tum", ".json"
+ENDINGS = *TEXTS, ".mat", ".npz", ".npy", ".parquet", ".feather", ".arrow", ".h5", ".hdf5", ".xlsx", ".xls"
 
 
 def sequences_below(source: Path) -> list[Sequence]:
@@ -153,7 +138,17 @@ def _tables(folder: Path) -> list[Path]:
 
 
 def _files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if Path(table_name(path)).suffix.lower() in ENDINGS)
+    """Files with the ending of a table."""
+    endings = {path: Path(table_name(path)).suffix.lower() for path in folder.iterdir()}
+    return sorted(path for path, ending in endings.items() if ending in ENDINGS and (ending != ".log" or _is_table_log(path)))
+
+
+def _is_table_log(path: Path) -> bool:
+    """Whether a .log is a table: one with names, of an IMU or of poses; no DataFlash, no messages of a program."""
+    if not path.is_file() or head(path).startswith(TEXT_START):
+        return False
+    seen = look(path)
+    return any((seen.header, seen.is_imu, seen.may_be_imu, seen.has_poses))
 
 
 def _sensor_folders(folder: Path) -> list[Path]:

@@ -17,7 +17,7 @@ from imutool.array_types import Bool, Float64, Int64
 from imutool.bias.model import GAP_S
 from imutool.cleaning import rows
 from imutool.cleaning.rules.saturation import at_limit
-from imutool.cleaning.rules.stuck import repeated
+from imutool.cleaning.rules.stuck import STILL_GYRO, failed_gyro, repeated
 from imutool.cleaning.samples import FrameCounts
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.file_location import Location
@@ -108,14 +108,15 @@ def measured_imu(imu: Imu, where: str, *, free_fall: bool = False) -> Imu:
 
 
 def measured_recording(recording: Recording, *, free_fall: bool = False) -> Recording:
-    """A recording without the IMU samples that are no measurement, or repeat the one before."""
+    """A recording without the IMU samples that are no measurement, or of a stuck sensor."""
     imu = measured_imu(recording.imu, recording.name, free_fall=free_fall)
-    repeats = repeated(np.concatenate([imu.gyro, imu.accel], axis=1))
-    if repeats.any():
-        stuck = f"{recording.name}: the sensor was stuck: %d samples that repeat the one before are left out, from %.3f s on"
-        logger.warning(stuck, repeats.sum(), seconds(imu.t_ns[repeats][:1], int(imu.t_ns[0]))[0])
-        imu = imu.rows(~repeats)
-    return replace(recording, imu=imu)
+    u = np.concatenate([imu.gyro, imu.accel], axis=1)
+    repeats, failed = repeated(u), failed_gyro(imu.t_ns, u)
+    for stuck, what in ((repeats, "samples that repeat the one before"), (failed & ~repeats, STILL_GYRO)):
+        if stuck.any():
+            text = f"{recording.name}: the sensor was stuck: %d {what} are left out, from %.3f s on"
+            logger.warning(text, stuck.sum(), seconds(imu.t_ns[stuck][:1], int(imu.t_ns[0]))[0])
+    return replace(recording, imu=imu.rows(~(repeats | failed)) if (repeats | failed).any() else imu)
 
 
 def within_range(recording: Recording) -> Recording:

@@ -258,8 +258,16 @@ def _rule(name: str) -> type[Rule]:
     return next(cls for cls in own if issubclass(cls, Rule))
 
 
-def raw_batches(log: Log, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[ImuBatch]:
+def raw_batches(
+    log: Log,
+    topic: str,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+    unreadable: Callable[[str], None] = lambda _: None,
+) -> Iterator[ImuBatch]:
     """Messages of an IMU as recorded, in file order, with unchecked values; log times select.
+
+    A message that is none of an IMU has NaN; `unreadable` is called with what is wrong with it.
 
     Raises:
         LogError: no such IMU topic, another encoding, or damage.
@@ -267,7 +275,7 @@ def raw_batches(log: Log, topic: str, start_ns: int | None = None, end_ns: int |
     described = log.topic(topic, (schemas.IMU,))
     for rows in messages.joined(rows for _, rows in log.rows([described.name], start_ns, end_ns)):
         with log.named(described.name):
-            yield from described.decode_imu(rows)
+            yield from described.decode_imu(rows, unreadable)
 
 
 def _reasons(settings: CleaningSettings, whole: TopicSummary, invalid: int, findings: Sequence[Finding]) -> Iterator[str]:

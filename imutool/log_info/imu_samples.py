@@ -27,6 +27,7 @@ from imutool.recording.columns import clock_jumps, median
 from imutool.recording.sample_order import TICK_SPAN, ticked
 
 APART_NS = nanoseconds(60.0)  # of stretches that are read by themselves
+MAX_NAMED = 5  # unreadable messages
 ROUNDING_NS = 1024  # of times as floats
 MARGIN = TICK_SPAN + 1  # stamps on both sides that show whether a step lost samples
 NO_FAULTS = Stamps(np.zeros(0, np.int64), "", Counter(), 1.0, unset=False)
@@ -41,6 +42,7 @@ class ImuSamples:
         sound: stamps of the samples.
         frames: messages by the frame that they name.
         stamps, jumps: faults of the stamps, and jumps of their clock.
+        unreadable: what is wrong with the first messages that are none of an IMU.
         unsorted: whether the messages are one recording in another order than that of their log times.
     """
 
@@ -57,7 +59,9 @@ class ImuSamples:
         self.frames = FrameCounts()
         recorded, self.sound = SensorStamps(), IncreasingStamps()
         self.stamps, self.unsorted, messages, finite = NO_FAULTS, False, 0, 0
-        for samples in blocks(counted_frames(raw_batches(log, topic), self.frames)):
+        self.unreadable = list[str]()
+        batches = raw_batches(log, topic, unreadable=self._name)
+        for samples in blocks(counted_frames(batches, self.frames)):
             good = measured(samples.values)
             recorded.see(samples.stamp_ns)
             self.sound.see(samples.stamp_ns[good])
@@ -70,6 +74,10 @@ class ImuSamples:
         self.counts = {"out_of_order": 0, "duplicated": 0, "missing": 0, "not_finite": messages - finite, "saturated": 0}
         if not recorded.sound:
             self._hold_stamps()
+
+    def _name(self, unreadable: str) -> None:
+        if len(self.unreadable) < MAX_NAMED:
+            self.unreadable.append(unreadable)
 
     def __len__(self) -> int:
         return self.sound.count

@@ -16,6 +16,7 @@ from msgspec import UnsetType
 from imutool.array_types import Float64
 from imutool.cleaning.rules import saturation
 from imutool.cleaning.rules.gaps import pause_words
+from imutool.cleaning.rules.stuck import Stuck
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.file_location import Location, log_name
 from imutool.inertial.stationary import Batch, Blocks, block_statistics, resting_blocks
@@ -154,8 +155,10 @@ def _imu(
     imu = ImuSamples(log, topic.name)
     motion = ImuMotion(imu.sound.steps.median(), poses)
 
+    stuck = Stuck()
+
     def seen() -> Iterator[Batch]:
-        for samples in imu.counted():
+        for samples in stuck(imu.counted()):
             motion.see(samples)
             yield samples.stamp_ns, samples.values[:, :3], samples.values[:, 3:]
 
@@ -164,11 +167,12 @@ def _imu(
     used, others, unit = _times(topic)
     found = conventions(whole) if len(imu) else []
     of_motion = [*motion.constant_sensors(), *convention_warnings(whole)] if len(imu) else ["no samples"]
+    of_stuck = [f"{finding.count} {finding.what}" for finding in stuck.findings(whole) if finding.action == "dropped"]
     of_motion = of_motion or lean_warnings(motion, whole)
     misread = any(entry.subject == QUATERNIONS for entry in found)  # such poses turn as no body does
     return ImuInfo(
         topic=topic.name,
-        warnings=[*_imu_warnings(imu), *of_motion],
+        warnings=[*_imu_warnings(imu), *of_stuck, *of_motion],
         conventions=found if len(imu) else UNSET,
         derived_from=derived_from,
         time=used,
@@ -245,6 +249,7 @@ def _imu_warnings(imu: ImuSamples) -> list[str]:
         "saturated": "saturated",
     }
     warnings = [f"{n} sample{'s' * (n != 1)} {text}" for key, text in words.items() if (n := imu.counts[key])]
+    warnings += imu.unreadable
     if imu.unsorted:
         warnings.append("the messages are not in order of their log time; imutool convert LOG OUT puts them in order")
     warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in imu.stamps.faults]

@@ -91,15 +91,27 @@ class Topic:
         """Heads and payloads of the chosen messages, per stretch of equal size."""
         yield from messages.cut(found, mask) if self.reflected is None else self.reflected.cut(found, mask)
 
-    def decode_imu(self, rows: Rows) -> Iterator[ImuBatch]:
+    def decode_imu(self, rows: Rows, unreadable: Callable[[str], None] | None = None) -> Iterator[ImuBatch]:
         """IMU messages from their bytes, one batch per stretch with one frame, unchecked.
 
+        `unreadable` is called with what is wrong with a payload that is no such message. It has NaN, and its log time.
+
         Raises:
-            LogError: a payload that is no such message.
+            LogError: a payload that is no such message, without `unreadable`.
         """
-        for cut, layout in _runs(rows, schemas.IMU, self._encoding):
-            columns = decode_imu(cut.payload, self._encoding, layout)
-            yield ImuBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
+        while len(rows.sequence):
+            try:
+                for cut, layout in _runs(rows, schemas.IMU, self._encoding):
+                    columns = decode_imu(cut.payload, self._encoding, layout)
+                    rows = rows.where(slice(len(cut.sequence), None))
+                    yield ImuBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
+            except LogError as error:
+                if unreadable is None:
+                    raise
+                unreadable(error.what)
+                _, log_time, publish_time, sequence, _ = rows.where(slice(1))
+                yield ImuBatch(log_time, publish_time, sequence, log_time, nan := np.full((1, 3), np.nan), nan, "")
+                rows = rows.where(slice(1, None))
 
     def vectors(self, rows: Rows, sensor: str) -> Iterator[Vectors]:
         """Samples of one sensor, `gyro` or `accel`, from messages of an IMU or from plain vectors.

@@ -295,6 +295,15 @@ def test_samples_of_a_stuck_sensor_are_left_out_and_those_of_one_without_noise_s
     assert measured_recording(still).imu is still.imu
 
 
+def test_samples_of_a_gyro_that_fails_are_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    recording = flight(1, duration_s=10.0)
+    gyro = np.round(recording.imu.gyro / 0.002) * 0.002
+    gyro[800:1200] = 0.002 * (np.array([382, 383, 384]) + np.arange(400)[:, None] // [3, 5, 1000] % 2)
+    left = measured_recording(replace(recording, imu=replace(recording.imu, gyro=gyro)))
+    np.testing.assert_array_equal(left.imu.t_ns, np.delete(recording.imu.t_ns, np.s_[800:1200]))
+    assert "400 samples whose gyro stands still within one count while the accelerometer moves are left out" in caplog.text
+
+
 def test_a_sensor_at_rest_whose_digits_are_coarser_than_its_noise_is_not_stuck() -> None:
     """It repeats itself, and then one axis alone changes."""
     recording = flight(1, duration_s=5.0)

@@ -167,6 +167,20 @@ def test_stuck_samples_but_the_first_are_dropped(made):
     assert one.intervals_ns == ((int(made.stamp_ns[3001]), int(made.stamp_ns[3040])),)
 
 
+def test_a_gyro_within_one_count_while_the_accelerometer_moves_is_left_out(made):
+    """Two of its axes alternate between two counts, as those of a board that failed."""
+    count, rows = 0.002, slice(3000, 3500)
+    coarse = made._replace(gyro=np.round(made.gyro / count) * count)
+    failed, at_rest = coarse.gyro.copy(), coarse.accel.copy()
+    failed[rows] = count * (np.array([382, 382, 384]) + np.arange(500)[:, None] // [7, 3, 1000] % 2)
+    at_rest[rows] = at_rest[3000] + 0.01 * np.arange(500)[:, None] % 0.05
+    survey = look(coarse._replace(gyro=failed))
+    assert np.flatnonzero(survey.dropped).tolist() == list(range(3000, 3500))
+    assert {one.count for one in survey.findings if one.action == "dropped"} == {500}
+    assert not look(coarse).dropped.any()
+    assert not look(coarse._replace(gyro=failed, accel=at_rest)).dropped.any()  # of another bias
+
+
 def test_a_noiseless_sensor_at_rest_is_not_stuck(made):
     """Smooth motion without noise, then rest: nothing is dropped, and it is said."""
     t = np.arange(8000) / 200.0

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.io
 from scipy.spatial.transform import Rotation
+from support.flight_logs import write_dataflash
 from support.tables import write_csv
 
 from imutool.conversion.run import convert
@@ -628,3 +629,16 @@ def test_a_table_that_joins_two_others_is_no_imu_of_its_own(tmp_path):
     log = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"})
     assert [*log.imus] == ["/imu0"]
     assert any("/final/imu is left out: it holds the samples of /imu0" in note for note in log.remarks.notes)
+
+
+def test_tables_in_log_files_and_those_of_programs_that_are_none(tmp_path):
+    table_text = "time_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n" + rows(T_S, GYRO, ACCEL)
+    for name in ("walk1.log", "walk2.log"):
+        (tmp_path / name).write_text(table_text)
+    assert [each.name for each in table.sequences(tmp_path)] == ["walk1", "walk2"]
+    (tmp_path / "walk1.log").rename(tmp_path / "imu.csv")
+    write_dataflash(tmp_path / "walk2.log", text=True)
+    said = (f"2026-11-30 12:00:{n % 60:02}.5 INFO node: value {n / 10} of {n}\n" for n in range(COUNT))
+    (tmp_path / "debug.log").write_text("".join(said))
+    (found,) = table.sequences(tmp_path)
+    assert found.path == tmp_path / "imu.csv"

@@ -18,8 +18,9 @@ import pytest
 from mcap.records import Chunk, ChunkIndex
 from mcap.writer import Writer
 
-from imutool.cleaning import raw_batches
+from imutool.cleaning import look, raw_batches
 from imutool.errors import ConfigError, LogError
+from imutool.log_info.inspection import inspect
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose, encode_vector3
@@ -226,7 +227,12 @@ def test_a_payload_that_is_no_message_is_refused_by_its_number(foreign: Foreign,
     *head, payload = messages[7]
     messages[7] = (*head, payload[:12] + b"\xff" * 4 + payload[16:])  # the length of a text
     with pytest.raises(LogError, match=r"message 7 \(log .*\) is no sensor_msgs/msg/Imu: .*\. Cut the log before or after it"):
-        read(foreign(messages))
+        read(path := foreign(messages))
+    imu = inspect(path).imu[0]
+    assert (imu.samples, imu.not_finite) == (20, 1)
+    assert [w for w in imu.warnings if w.startswith("message 7 (log ")]  # the report on all others was refused, too
+    with Log(path) as log:
+        assert np.flatnonzero(look(log, "/imu").dropped).tolist() == [7]
 
 
 def test_images_that_are_none_are_left_out_and_named(foreign: Foreign, make: Make, caplog: pytest.LogCaptureFixture) -> None:

@@ -1,21 +1,26 @@
-"""Stuck values: a sensor that repeats its last sample, an axis that does not change.
+"""Stuck values: repeated samples, an axis without changes, a gyro within one count.
 
 A sensor with noise does not give six equal numbers twice; in 23 real recordings two samples in a row are the longest such
 run. In a noise-free simulation at rest it does, so repeats are only dropped where the samples that do change show noise:
 third differences then exceed second ones (by sqrt(20/6) for white noise), and in smooth motion they are far smaller.
+
+A gyro that fails may alternate between two counts. It has noise elsewhere, reads other rates than usual on two axes or more (a
+vehicle's long turn is about one), and stands still while the specific force changes: at rest that stands still, too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Bool, Float64, Int64
 from imutool.cleaning.finding import Finding, Intervals
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.rules.not_finite import AXES
-from imutool.cleaning.samples import Samples, padded
+from imutool.cleaning.samples import STEP_NS, Motion, Samples, padded
 from imutool.recording.columns import median, true_ranges
 
 MIN = 10  # equal samples in a row
@@ -23,6 +28,9 @@ MAX_EQUAL = 3  # of six axes, apart from a run: a sensor that is slower than the
 AXIS_MIN, AXIS_MIN_S = 100, 1.0  # of one axis alone; the longest in real recordings is 17, or 0.17 s
 HELD_SHARE = 0.3  # of neighbours that are equal: the topic is faster than its sensor
 AXIS_DISTRUST = 0.1  # of the time
+WITHIN = 1.5  # counts: the next one is two away
+MOVES = 0.05  # of the usual specific force, by which its means of 0.1 s differ: 0.5 m/s²
+STILL_GYRO = "samples whose gyro stands still within one count while the accelerometer moves"
 
 
 class Stuck(Rule):
@@ -36,10 +44,12 @@ class Stuck(Rule):
         self._noisy = True
         self._equal, self._pairs = 0, 0
         self._axes = [_Axis() for _ in AXES]
+        self._gyro = _StillGyro()
 
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
         """Yield the samples without repeats."""
-        for around, core in padded(stream, MIN):
+        for around, core in padded(stream, AXIS_MIN):
+            self._gyro.see(around, core)
             same, in_runs = _repeats(around.values)
             self._noisy = _noisy(around.values[~same], self._noisy)
             samples, repeated = around.where(core), in_runs[core]
@@ -67,6 +77,7 @@ class Stuck(Rule):
             share = self._equal / self._pairs
             what = "samples equal to the one before: the topic is faster than its sensor"
             yield Finding("stuck", "warning", what, self._equal, values={"share": share}, confidence=0.9)
+        yield from self._still_gyro(whole)
         total_s = (whole.motion.end_ns - (whole.motion.start_ns or 0)) * 1e-9
         for name, axis in zip(AXES, self._axes, strict=True):
             axis.close()
@@ -78,6 +89,72 @@ class Stuck(Rule):
                 yield Finding(
                     "stuck", "error" if distrust else "warning", what, **axis.places.where(), values=values, distrust=distrust
                 )
+
+    def _still_gyro(self, whole: TopicSummary) -> Iterator[Finding]:
+        places = Intervals()
+        for run in self._gyro.failed(whole.motion):
+            places.add_run(run.numbers, run.stamps_ns, run.numbers[1] - run.numbers[0] + 1)
+            self.dropped.append(np.arange(run.numbers[0], run.numbers[1] + 1))
+        if places.count:
+            yield Finding("stuck", "warning", STILL_GYRO, **places.where(), action="dropped", confidence=0.9)
+
+
+@dataclass
+class _Run:
+    """Run of a gyro within one count; `low` and `high` are its extremes."""
+
+    numbers: tuple[int, int]
+    stamps_ns: tuple[int, int]
+    low: Float64[np.ndarray, "3"]
+    high: Float64[np.ndarray, "3"]
+
+
+class _StillGyro:
+    """Runs of a gyro that stays within one count on all axes, across blocks."""
+
+    def __init__(self) -> None:
+        self._runs: list[_Run] = []
+        self._count, self._goes_on = np.full(3, np.inf), False
+
+    def see(self, around: Samples, core: slice) -> None:
+        """Add the samples of the core, with their neighbours."""
+        steps = np.abs(np.diff(around.values[:, :3], axis=0))
+        self._count = np.minimum(self._count, np.where(steps > 0.0, steps, np.inf).min(axis=0, initial=np.inf))
+        samples = around.where(core)
+        still = self._still(around.values[:, :3], steps)[core]
+        for first, end in true_ranges(still):
+            numbers, stamps_ns = ((int(x[first]), int(x[end - 1])) for x in (samples.number, samples.stamp_ns))
+            low, high = (extreme(samples.values[first:end, :3], axis=0) for extreme in (np.min, np.max))
+            if first == 0 and self._goes_on:
+                run = self._runs.pop()
+                numbers, stamps_ns = (run.numbers[0], numbers[1]), (run.stamps_ns[0], stamps_ns[1])
+                low, high = np.minimum(run.low, low), np.maximum(run.high, high)
+            self._runs.append(_Run(numbers, stamps_ns, low, high))
+        self._goes_on = bool(len(still) and still[-1])
+
+    def _still(self, gyro: Float64[np.ndarray, "n 3"], steps: Float64[np.ndarray, "m 3"]) -> Bool[np.ndarray, " n"]:
+        """Samples in `AXIS_MIN` within one count."""
+        still = np.zeros(len(gyro), bool)
+        for first, end in true_ranges(np.asarray((steps <= WITHIN * self._count).all(axis=1))):
+            if end - first >= AXIS_MIN - 1:
+                windows = sliding_window_view(gyro[first : end + 1], AXIS_MIN, axis=0)
+                for k in np.flatnonzero((np.ptp(windows, axis=2) <= WITHIN * self._count).all(axis=1)):
+                    still[first + k : first + k + AXIS_MIN] = True
+        return still
+
+    def failed(self, motion: Motion) -> Iterator[_Run]:
+        """Runs in which the gyro failed."""
+        if not self._runs or not all(_noisy(column[:, None], before=False) for column in motion.rates.T):
+            return
+        step, mean = motion.table()
+        t_ns, usual = step * STEP_NS + (motion.start_ns or 0), np.median(mean, axis=0)
+        for run in self._runs:
+            inside = mean[(t_ns >= run.stamps_ns[0]) & (t_ns <= run.stamps_ns[1]), 3:]
+            lasts = run.stamps_ns[1] - run.stamps_ns[0] >= AXIS_MIN_S * 1e9 and len(inside) > 1
+            is_one = (run.high - run.low <= WITHIN * self._count).all()
+            unusual = (np.abs((run.low + run.high) / 2.0 - usual[:3]) > WITHIN * self._count).sum() > 1
+            if lasts and is_one and unusual and np.ptp(inside, axis=0).max() > MOVES * np.linalg.norm(usual[3:]):
+                yield run
 
 
 class _Axis:
@@ -125,6 +202,17 @@ def repeated(values: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
     return in_runs & _noisy(values[~same], before=False)
 
 
+def failed_gyro(t_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
+    """Samples whose gyro stands still within one count while the accelerometer moves."""
+    samples = Samples(np.arange(len(t_ns)), t_ns, t_ns, values)
+    gyro, motion, failed = _StillGyro(), Motion(), np.zeros(len(t_ns), bool)
+    gyro.see(samples, slice(None))
+    motion.see(samples)
+    for run in gyro.failed(motion):
+        failed[run.numbers[0] : run.numbers[1] + 1] = True
+    return failed
+
+
 def _repeats(values: Float64[np.ndarray, "n 6"]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Samples that repeat the one before, and those of them in runs of `MIN` and more.
 
@@ -139,7 +227,7 @@ def _repeats(values: Float64[np.ndarray, "n 6"]) -> tuple[Bool[np.ndarray, " n"]
     return same, in_runs
 
 
-def _noisy(values: Float64[np.ndarray, "n 6"], before: bool) -> bool:
+def _noisy(values: Float64[np.ndarray, "n k"], before: bool) -> bool:
     """Whether samples show noise; `before` for too few samples."""
     if len(values) < 4 * MIN:
         return before

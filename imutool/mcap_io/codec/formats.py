@@ -20,7 +20,8 @@ UNITS_NS = {1: "ns", 1000: "us", 10**6: "ms", NS_PER_S: "s"}
 FEW, MIN_PASSED_NS, MAX_PASSED_NS = 2000, NS_PER_S // 4, 10 * NS_PER_S  # messages that show the unit, and their time
 CLOCK_ERROR, LATENCY_NS = 0.02, NS_PER_S // 10  # by which a clock and its recorder differ; units do by a factor of a thousand
 MAX_SAME = 0.01  # share of the messages with a time that others have, too
-SECONDS, NANOSECONDS = ("sec", "seconds", "secs"), ("nsec", "nanos", "nanosec", "nsecs", "nanoseconds")
+SECONDS = dict.fromkeys(("sec", "seconds", "secs", "tv_sec"), NS_PER_S)  # in the parts of a stamp
+FRACTIONS = dict.fromkeys(("nsec", "nanos", "nanosec", "nsecs", "nanoseconds", "tv_nsec"), 1) | {"usec": 1000, "tv_usec": 1000}
 WORDS = {  # in the names of fields
     "gyro": r"(angular_?velocity|gyro(scope)?|ang_?vel|rotation_?rate|angular_?rate|omega)",
     "accel": r"(linear_?acceleration|accel(eration|erometer)?|acc|specific_?force)",
@@ -118,9 +119,9 @@ def stamps_of(fields: Iterable[tuple[Path, str, Any]]) -> Iterator[tuple[tuple[P
     """Fields that make up each stamp of a known unit; the first counts."""
     for path, name, node in fields:
         if isinstance(node, Mapping) and re.fullmatch(STAMP, name):
-            parts = [next((key for key in keys if node.get(key) == NUMBER), None) for keys in (SECONDS, NANOSECONDS)]
-            if parts[0] is not None and parts[1] is not None:
-                yield ((*path, parts[0]), NS_PER_S), ((*path, parts[1]), 1)
+            named = [[(key, size) for key, size in part.items() if node.get(key) == NUMBER] for part in (SECONDS, FRACTIONS)]
+            if all(named):
+                yield tuple(((*path, key), size) for (key, size), *_ in named)
         for pattern, size in COUNTED.items():
             if node == NUMBER and re.fullmatch(pattern, name):
                 yield ((path, size),)
@@ -191,16 +192,12 @@ def refuse_long(raw: bytes) -> None:
 
 def _tree(value: Any, depth: int) -> Any:
     """Tree of the fields of a JSON value."""
-    if isinstance(value, bool) or value is None:
-        return ""
-    if isinstance(value, int | float):
-        return NUMBER
-    if isinstance(value, str):
-        return TEXT
+    if isinstance(value, int | float | str) and not isinstance(value, bool):
+        return TEXT if isinstance(value, str) else NUMBER
     if isinstance(value, list):
         numbers = all(isinstance(part, int | float) and not isinstance(part, bool) for part in value)
         return {3: VECTOR, 9: MATRIX}.get(len(value), "") if numbers else ""
-    return {name: _tree(part, depth - 1) for name, part in value.items()} if depth else ""
+    return {name: _tree(part, depth - 1) for name, part in value.items()} if depth and isinstance(value, dict) else ""
 
 
 class Json:

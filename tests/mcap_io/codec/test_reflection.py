@@ -188,6 +188,17 @@ def test_a_message_of_the_same_type_gets_its_stamp_in_its_unit() -> None:
     assert json.loads(settled.from_cdr(settled.encode([sample]))[0])["t"] == 1.5
 
 
+@pytest.mark.parametrize("parts", [("tv_sec", "tv_nsec"), ("tv_sec", "tv_usec"), ("sec", "usec")])
+def test_a_stamp_in_the_parts_of_posix_is_read_and_written(parts: tuple[str, str]) -> None:
+    """The samples had the log time."""
+    raw = json.dumps({"stamp": dict(zip(parts, (7, 250), strict=True)), "gyro": [1, 2, 3], "accel": [4, 5, 6]}).encode()
+    found = reflect("json", "/imu", "Imu", b"", raw)
+    assert isinstance(found, Reflected)
+    sample = found.sample(raw, START_NS)
+    assert sample.stamp_ns == 7_000_000_000 + 250 * (1 if "nsec" in parts[1] else 1000)
+    assert json.loads(found.from_cdr(found.encode([sample]))[0])["stamp"] == json.loads(raw)["stamp"]
+
+
 @pytest.mark.parametrize(
     "fields",
     [
