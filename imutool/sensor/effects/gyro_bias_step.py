@@ -114,7 +114,8 @@ def _largest(
         shared = from_on(basis[:, :, None] * x[:, None])
         N = from_on(x[:, :, None] * x[:, None]) - shared.transpose(0, 2, 1) @ shared
         each = np.arange(x.shape[1])
-        N[:, each, each] = np.maximum(N[:, each, each], np.maximum((x**2).mean(axis=0), np.finfo(np.float64).tiny))
+        least = np.maximum((x**2).mean(axis=0), np.finfo(np.float64).tiny)
+        N[:, each, each] = (1.0 + INDEPENDENT) * np.maximum(N[:, each, each], least)  # few rows leave columns alike
         sums = from_on(x * left[:, None])
         sizes.append(np.linalg.solve(N, sums[..., None])[..., 0])
         gain += (sums * sizes[-1]).sum(axis=1) / max(float((left**2).mean()), np.finfo(np.float64).tiny)
