@@ -167,7 +167,7 @@ def test_an_onset_of_a_g_sensitivity_is_found_in_a_log_that_ends_at_rest() -> No
     force[t >= 15.0] = [1.0, 2.0, 4.0]
     sensitivity = 1e-3 * rng.normal(size=(3, 3))
     error = (t[:, None] >= 8.0) * (force @ sensitivity.T)
-    columns = [np.repeat(along[:, None], 3, axis=1) for along in force.T]
+    columns = [along[:, None] for along in force.T]
     start = gyro_bias_step.likeliest_onset(t, error, (t < 1.0).astype(float)[:, None], setting_in=columns)
     assert start[-1] == pytest.approx(8.0, abs=1.0 / RATE_HZ)
     close(start[:-1].reshape(3, 3), sensitivity, 1e-6)
