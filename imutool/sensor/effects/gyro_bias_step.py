@@ -114,8 +114,8 @@ def _largest(
         shared = from_on(basis[:, :, None] * x[:, None])
         N = from_on(x[:, :, None] * x[:, None]) - shared.transpose(0, 2, 1) @ shared
         each = np.arange(x.shape[1])
-        least = np.maximum((x**2).mean(axis=0), np.finfo(np.float64).tiny)
-        N[:, each, each] = (1.0 + INDEPENDENT) * np.maximum(N[:, each, each], least)  # few rows leave columns alike
+        minimum = np.maximum((x**2).mean(axis=0), np.finfo(np.float64).tiny)
+        N[:, each, each] = (1.0 + INDEPENDENT) * np.maximum(N[:, each, each], minimum)  # few rows leave columns alike
         sums = from_on(x[:, :, None] * left[:, None])
         size = np.linalg.solve(N, sums)
         sizes.append(size.transpose(0, 2, 1).reshape(len(size), -1))
