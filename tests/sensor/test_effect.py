@@ -16,7 +16,7 @@ from imutool import registry
 from imutool.errors import ConfigError, DataError
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Stage, distort
-from imutool.sensor.effects import clock_wander, low_pass
+from imutool.sensor.effects import clock_wander, gyro_bias_step, low_pass
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.signals import SLOW_S
 
@@ -158,6 +158,19 @@ def test_a_linear_one_adds_in_proportion(one: Effect) -> None:
     zero, once, twice = (numbers(one.forward(ideal(one, felt), k * theta)) for k in (0.0, 1.0, 2.0))
     for name in zero:
         close(twice[name] - zero[name], 2.0 * (once[name] - zero[name]))
+
+
+def test_an_onset_of_a_g_sensitivity_is_found_in_a_log_that_ends_at_rest() -> None:
+    """Forces that stay the same leave the columns of an axis alike: from there on, no one has a size of its own."""
+    t, rng = clock(20.0), np.random.default_rng(3)
+    force = rng.normal(size=(len(t), 3))
+    force[t >= 15.0] = [1.0, 2.0, 4.0]
+    sensitivity = 1e-3 * rng.normal(size=(3, 3))
+    error = (t[:, None] >= 8.0) * (force @ sensitivity.T)
+    columns = [along[:, None] for along in force.T]
+    start = gyro_bias_step.likeliest_onset(t, error, (t < 1.0).astype(float)[:, None], setting_in=columns)
+    assert start[-1] == pytest.approx(8.0, abs=1.0 / RATE_HZ)
+    close(start[:-1].reshape(3, 3), sensitivity, 1e-6)
 
 
 @pytest.mark.parametrize("one", WITH_STARTS)

@@ -75,16 +75,16 @@ def likeliest_onset(
     error: Float64[np.ndarray, "n 3"],
     beside: Float64[np.ndarray, "n q"],
     before: int = 0,
-    setting_in: Sequence[Float64[np.ndarray, "_ 3"]] = (),
+    setting_in: Sequence[Float64[np.ndarray, "_ a"]] = (),
 ) -> Theta:
     """Sizes by axis, then the time, of the onset that explains most of an error.
 
     A constant sets in, or signals of `setting_in`, between two samples, together with some columns and so many likelier
-    constants. Of several signals an axis has a size for each. Each axis counts by what is left there. In least squares further
-    columns X gain left' X (X' X)^-1 X' left, all less their projection on the others (Frisch and Waugh, Econometrica 1933);
-    for all columns that set in at one time these are sums from that time on.
+    constants. Of several signals an axis has a size for each; a signal of one column is that of all axes. Each axis counts by
+    what is left there. In least squares further columns X gain left' X (X' X)^-1 X' left, all less their projection on the
+    others (Frisch and Waugh, Econometrica 1933); for all columns that set in at one time these are sums from that time on.
     """
-    columns = np.stack(setting_in or [np.ones(error.shape)], axis=2)
+    columns = np.stack(setting_in or [np.ones((len(t_s), 1))], axis=2)
     basis = orthonormal(beside)
     size, row = _largest(t_s, error, basis, columns)
     for _ in range(before):
@@ -105,19 +105,21 @@ def _largest(
     t_s: Float64[np.ndarray, " n"],
     error: Float64[np.ndarray, "n 3"],
     basis: Float64[np.ndarray, "n q"],
-    columns: Float64[np.ndarray, "n 3 m"],
+    columns: Float64[np.ndarray, "n a m"],
 ) -> tuple[Theta, int]:
     """Sizes, axis by axis, of what explains most by setting in, after orthonormal columns, and the sample before it."""
     rest = error - basis @ (basis.T @ error)
-    sizes, gain = list[Float64[np.ndarray, "n-1 m"]](), np.zeros(len(t_s) - 1)
-    for x, left in zip(columns.transpose(1, 0, 2), rest.T, strict=True):
+    sizes, gain = list[Float64[np.ndarray, "n-1 _"]](), np.zeros(len(t_s) - 1)
+    for x, left in zip(columns.transpose(1, 0, 2), np.split(rest, columns.shape[1], axis=1), strict=True):
         shared = from_on(basis[:, :, None] * x[:, None])
         N = from_on(x[:, :, None] * x[:, None]) - shared.transpose(0, 2, 1) @ shared
         each = np.arange(x.shape[1])
-        N[:, each, each] = np.maximum(N[:, each, each], np.maximum((x**2).mean(axis=0), np.finfo(np.float64).tiny))
-        sums = from_on(x * left[:, None])
-        sizes.append(np.linalg.solve(N, sums[..., None])[..., 0])
-        gain += (sums * sizes[-1]).sum(axis=1) / max(float((left**2).mean()), np.finfo(np.float64).tiny)
+        minimum = np.maximum((x**2).mean(axis=0), np.finfo(np.float64).tiny)
+        N[:, each, each] = (1.0 + INDEPENDENT) * np.maximum(N[:, each, each], minimum)  # few rows leave columns alike
+        sums = from_on(x[:, :, None] * left[:, None])
+        size = np.linalg.solve(N, sums)
+        sizes.append(size.transpose(0, 2, 1).reshape(len(size), -1))
+        gain += (sums * size / np.maximum((left**2).mean(axis=0), np.finfo(np.float64).tiny)).sum(axis=(1, 2))
     row = best_row(t_s, gain)
     return np.concatenate([size[row] for size in sizes]), row
 

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis, residual
 from imutool.sensor.effects import gyro_delay, gyro_g_sensitivity, mount_rotation
 from imutool.sensor.effects.gyro_bias_step import followed, likeliest_onset
-from imutool.sensor.samples import IdealMotion, SensorSamples, Vectors
+from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import Sensor
 
 STEP = "step"  # variant of an effect that sets in at one time, also next to that of the whole log
@@ -76,12 +77,12 @@ def _from_one_time_on(whole: Effect) -> Effect:
     )
 
 
-def _columns(whole: Effect, ideal: SensorSamples) -> list[Vectors]:
-    """What a size of an effect adds to each axis, one after another where several add to it."""
+def _columns(whole: Effect, ideal: SensorSamples) -> list[Float64[np.ndarray, "n a"]]:
+    """What a size of an effect adds to each axis, or to all alike, one after another where several add to it."""
     if whole.name == gyro_delay.EFFECT.name:
         return [-ideal.alpha]
     if whole.name == gyro_g_sensitivity.EFFECT.name:
-        return [np.repeat(force[:, None], 3, axis=1) for force in ideal.accel.T]
+        return [force[:, None] for force in ideal.accel.T]
     return [getattr(ideal, whole.sensors[0])]
 
 
