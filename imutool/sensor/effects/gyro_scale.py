@@ -61,7 +61,8 @@ def _from_one_time_on(whole: Effect) -> Effect:
         others, columns = np.column_stack([np.ones(len(t_s)), followed(ideal)]), _columns(whole, ideal)
         start = likeliest_onset(t_s, error, others, setting_in=columns)
         if len(start) > len(whole.parameters) + 1:  # one size for all axes
-            start = np.append(np.average(start[:-1], weights=(columns[0] ** 2).sum(axis=0)), start[-1])
+            weights = (columns[0] ** 2).sum(axis=0)
+            start = np.array([start[:-1] @ weights / max(weights.sum(), np.finfo(np.float64).tiny), start[-1]])
         return [start]
 
     return replace(
