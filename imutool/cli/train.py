@@ -131,12 +131,17 @@ def lines_of_choice(card: Mapping[str, Any]) -> list[str]:
         lines.append(f"neural ODE {kept}: held-out error of {', of '.join(errors)}")
     elif compared and len(card["logs"]) == 1:
         lines.append("no neural ODE: one log shows only what fits its own motion")
-    held_out = {
-        s: found for s, found in card.get("held_out", {}).items() if found.get("closed_form", found["error"]) != found["error"]
-    }
-    if held_out and not compared:
-        errors = (f"{sensor} {e['closed_form']:.3g} to {e['error']:.3g} {e['unit']}" for sensor, e in held_out.items())
-        lines.append(f"held-out error, from the closed form to the network: {', '.join(errors)}")
+    held_out = {sensor: found for sensor, found in card.get("held_out", {}).items() if "closed_form" in found and not compared}
+    kept = card.get("left_out", {}).get("kept", {})
+    if refuted := [sensor for sensor in held_out if kept.get(sensor, card.get("method")) != card.get("method")]:
+        lines.append(f"no network for {' and '.join(refuted)}: left-out logs do not confirm it; --set compare=false keeps it")
+    gains = [
+        f"{sensor} {found['closed_form']:.3g} to {found['error']:.3g} {found['unit']}"
+        for sensor, found in held_out.items()
+        if sensor not in refuted
+    ]
+    if gains:
+        lines.append(f"held-out error, from the closed form to the network: {', '.join(gains)}")
     return lines
 
 

@@ -199,3 +199,6 @@ def test_training_tells_whether_the_neural_ode_is_in_the_model_and_what_it_chang
     network = {"held_out": {"gyro": {"error": 8.76e-4, "closed_form": 9.1e-4, "unit": "rad"}}}
     (line,) = lines_of_choice(network)
     assert line == "held-out error, from the closed form to the network: gyro 0.00091 to 0.000876 rad"
+    (line,) = lines_of_choice(network | {"method": "conv", "left_out": {"kept": {"gyro": "linear"}}})
+    assert line == "no network for gyro: left-out logs do not confirm it; --set compare=false keeps it"
+    assert lines_of_choice(network | {"method": "conv", "left_out": {"kept": {"gyro": "conv"}}}) == lines_of_choice(network)
