@@ -8,6 +8,7 @@ not, as over clipped samples, the path turns with them. The simplest candidate t
 beaten is kept, for the gyro by the orientation error (AOE) and by the attitude after 5 s from the truth, for the accelerometer
 by the velocity after 5 s. One or two logs are cut in parts, which are often no longer than a start from the truth. Their scores
 decide nothing: the candidate is kept that predicts the windows of each part best.
+A network is the least simple candidate (`network_scores`).
 Effects are linear in their parameters, so a left-out model is one Gauss-Newton step from the fit of all logs; the weights of
 outliers and the attitude under the accelerometer stay those of all logs (`tests/bench/left_out.py` fits anew).
 """
