@@ -57,15 +57,14 @@ def runs_away(model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float[Tensor
     columns = COLUMNS[sensor]
     for log, bias in enumerate(rest):
         rows = pool.log == log
-        t, gyro, accel = pool.t[rows] - pool.t[rows][0], pool.gyro[rows], pool.accel[rows]
-        at_rest = torch.cat([bias[:3], accel.mean(dim=0)]).expand(len(t), 6)
-        for u in (at_rest, torch.cat([gyro, accel], dim=1)):
-            state = bias[None].clone()
-            for _ in range(math.ceil(HOUR_S / float(t[-1]))):
-                path = model.rest_bias(sensor, Segment(t[None], u[None, :, :3], u[None, :, 3:], state))
-                if (path - bias[columns]).abs().max() > TURN_ON_STD[sensor]:
-                    return True
-                state[:, columns] = path[:, -1]
+        t, motion = pool.t[rows] - pool.t[rows][0], torch.cat([pool.gyro[rows], pool.accel[rows]], dim=1)
+        at_rest = torch.cat([bias[:3], motion[:, 3:].mean(dim=0)]).expand_as(motion)
+        u, state = torch.stack([at_rest, motion]), bias.repeat(2, 1)  # a step takes as long for both as for one
+        for _ in range(math.ceil(HOUR_S / float(t[-1]))):
+            path = model.rest_bias(sensor, Segment(t.expand(2, -1), u[..., :3], u[..., 3:], state))
+            if (path - bias[columns]).abs().max() > TURN_ON_STD[sensor]:
+                return True
+            state[:, columns] = path[:, -1]
     return False
 
 
