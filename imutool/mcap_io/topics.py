@@ -60,7 +60,7 @@ class Topic:
     metadata: Mapping[str, str]
     reflected: Reflected | JoinedImu | Transforms | None = None
     own_schema: str = ""  # name in the log of the type of a reflected IMU or pose
-    recorded_on: str = ""  # topic whose messages stand for its own: the gyro of a joined IMU, the IMU beside a pose
+    recorded_on: str = ""  # topic whose messages stand for its own: the gyro of a joined IMU, or an IMU with poses
 
     @property
     def is_derived(self) -> bool:
@@ -234,8 +234,8 @@ def reflected_topics(
             which = "two definitions" if len(texts[name]) > 1 else "another definition"
             found[name] = replace(topic, schema_name=f"{topic.schema_name} ({which})")
     settled = [_with_clock(topic, rows([name])) for name, topic in found.items()]
-    beside = [pose for topic in settled for pose in _poses_beside(topic)]
-    return {topic.name: topic for topic in [*settled, *(pose for pose in beside if pose.name not in topics)]}
+    poses = [pose for topic in settled for pose in _poses_with(topic)]
+    return {topic.name: topic for topic in [*settled, *(pose for pose in poses if pose.name not in topics)]}
 
 
 def _with_clock(topic: Topic, parts: Iterator[tuple[str, Rows]]) -> Topic:
@@ -246,7 +246,7 @@ def _with_clock(topic: Topic, parts: Iterator[tuple[str, Rows]]) -> Topic:
     return replace(topic, reflected=topic.reflected.settled(messages))
 
 
-def _poses_beside(imu: Topic) -> Iterator[Topic]:
+def _poses_with(imu: Topic) -> Iterator[Topic]:
     """Poses in the messages of an IMU: an estimate, unless the topic's name says more."""
     if isinstance(imu.reflected, Reflected) and (pose := imu.reflected.pose) is not None:
         name, marks = f"{imu.name}/pose", {KIND_KEY: computed_kind(imu.name, imu.own_schema)}
