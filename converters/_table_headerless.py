@@ -100,9 +100,13 @@ def in_an_array(columns: Columns) -> dict[str, Any]:
 
 
 def _halves(columns: Columns, names: list[str]) -> _Halves | None:
-    """The first six columns that are no time; None where not exactly one half shows gravity."""
-    time = names[:1] if names and rises(columns.values[names[0]]) else []
-    six = names[len(time) : len(time) + 6]
+    """The first six columns that are no time; None where not exactly one half shows gravity.
+
+    The time is the first column, or the seventh and last one: a board may print it behind its readings.
+    """
+    edges = [*names[:1], *(names[6:] if len(names) == 7 else [])]
+    time = [name for name in edges if rises(columns.values[name])][:1]
+    six = [name for name in names if name not in time][:6]
     shows = [_has_gravity(columns, half) for half in (six[:3], six[3:])] if len(six) == 6 else []
     if shows and time and not any(shows):  # increments of velocity, which a rate makes accelerations of
         rate_hz = 1.0 / float(np.nanmedian(np.diff(columns.values[time[0]].astype(float))))
@@ -191,8 +195,9 @@ def name_headerless(columns: Columns) -> None:
         count = len(numbered) - len(halves.time) - 6
         if count != _place_of_time(columns):
             return
-        new = [*["count"] * count, *["time"] * len(halves.time)]
-        new += [f"{sensor}_{axis}" for sensor in halves.sensors for axis in "xyz"]
+        axes = [f"{sensor}_{axis}" for sensor in halves.sensors for axis in "xyz"]
+        named = dict(zip([*halves.time, *halves.columns], [*["time"] * len(halves.time), *axes], strict=True))
+        new = [named.get(name, "count") for name in numbered]
         shown = halves.columns[:3] if halves.sensors[0] == "accel" else halves.columns[3:]
         begin, _, end = (name.removeprefix("column ") for name in shown)
         why = f"it has no header: columns {begin} to {end} show gravity and count as the accel"

@@ -533,15 +533,19 @@ def test_what_ros_echoes_of_an_imu_is_one(tmp_path):
     assert np.array_equal(imu.accel, ACCEL)
 
 
+@pytest.mark.parametrize("time", ["first", "last"])
 @pytest.mark.parametrize("first", ["gyro", "accel"])
-def test_a_time_and_six_axes_without_a_header_are_an_imu_by_its_gravity(tmp_path, first):
+def test_a_time_and_six_axes_without_a_header_are_an_imu_by_its_gravity(tmp_path, first, time):
+    """A board may print the time behind its readings."""
     sides = [GYRO, ACCEL] if first == "gyro" else [ACCEL, GYRO]
-    path = write_csv(tmp_path / "raw.csv", [], [T_NS, *sides[0].T, *sides[1].T])
+    axes = [*sides[0].T, *sides[1].T]
+    path = write_csv(tmp_path / "raw.csv", [], [T_NS, *axes] if time == "first" else [*axes, T_NS])
     with pytest.raises(ConfigError, match="no unit of the gyro") as asked:  # which at rest nothing shows
         table.read_sequence(table.sequences(path)[0])
     assert 'accel = ["accel_x", "accel_y", "accel_z"]\naccel_unit = "m/s^2"' in str(asked.value)
     (tmp_path / "map.toml").write_text(str(asked.value.fix).partition("\n\n")[2].replace('"?"', '"rad/s"'))
     imu = table.read_sequence(table.sequences(path)[0], mapping=tmp_path / "map.toml").imus["/imu0"]
+    assert np.array_equal(imu.t_ns, T_NS)
     assert np.array_equal(imu.gyro, GYRO)
     assert np.array_equal(imu.accel, ACCEL)
 
