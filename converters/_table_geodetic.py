@@ -1,4 +1,4 @@
-"""Latitude, longitude and height of true poses, as metres north, east and down.
+"""Latitude, longitude and height of true poses, as metres north, east and down; and poses about the centre of the Earth.
 
 In a plane about the first: north is (M + h) dlat and east (N + h) cos(lat) dlon, with the radii M and N of the ellipsoid there
 (WGS 84; Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, eq. 2.105, 2.106 and 2.111). A
@@ -11,7 +11,9 @@ import re
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Int64
+from imutool.geometry import quaternion
+from imutool.recording import Imu, interpolate
 
 from ._table_map import Entries
 from ._table_names import name_and_unit, split_name
@@ -28,6 +30,7 @@ GEODETIC = {
 }
 EASTING = "easting"
 LOCAL = "local_"  # begins the names of the columns that are made
+FROM_CENTRE_M = 6.3e6, 6.5e6  # of a place on the Earth, or above it
 
 
 def add_local(columns: Columns) -> None:
@@ -89,3 +92,27 @@ def plane(values: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
     about = (values[:, 1] - longitude + np.pi) % (2.0 * np.pi) - np.pi  # past the date line
     north = (north_m + height) * (values[:, 0] - latitude)
     return np.stack([north, (east_m + height) * np.cos(latitude) * about, height - values[:, 2]], axis=1)
+
+
+def to_east_north_up(
+    t_ns: Int64[np.ndarray, " n"], p: Float64[np.ndarray, "n 3"], q_wxyz: Float64[np.ndarray, "n 4"], imu: Imu
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 4"], list[str]]:
+    """Poses about the centre of the Earth in east, north, up, and a note; others as they are.
+
+    The rotations stay if the IMU's gravity shows that their world has z up, and not the axes of the Earth.
+    """
+    if not len(p) or not FROM_CENTRE_M[0] < np.linalg.norm(middle := np.median(p, axis=0)) < FROM_CENTRE_M[1]:
+        return p, q_wxyz, []
+    longitude = np.arctan2(middle[1], middle[0])
+    latitude = np.arctan2(middle[2], (1.0 - ECCENTRICITY_SQUARED) * np.hypot(*middle[:2]))  # exact on the ellipsoid
+    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
+    up = np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
+    R_enu_ecef = np.stack([east, np.cross(up, east), up])
+    note = "the positions count from the centre of the Earth (ECEF): they are east, north, up about the first in the log"
+    force = interpolate((t_ns - imu.t_ns[0]) * 1e-9, (imu.t_ns - imu.t_ns[0]) * 1e-9, imu.accel)
+    mean = np.nanmean(quaternion.rotate(q_wxyz, force), axis=0)
+    shares = [float(mean @ each) / float(np.linalg.norm(mean)) for each in (up, [0.0, 0.0, 1.0])]
+    p = (p - p[0]) @ R_enu_ecef.T
+    if shares[1] > max(UP, shares[0]):
+        return p, q_wxyz, [f"{note}; the rotations stay, whose world has +z up"]
+    return p, quaternion.multiply(quaternion.of_matrix(R_enu_ecef), q_wxyz), [f"{note}, and so are the rotations"]

@@ -26,6 +26,7 @@ from ._source import head, name
 from ._table_dates import said_epoch
 from ._table_files import kind_of, load
 from ._table_folder import load_split, sequences_below
+from ._table_geodetic import to_east_north_up
 from ._table_groups import MAX_CONSTANTS, group_entries, imus_apart, pose_clock, shared_group, time_beside, turned
 from ._table_layouts import known_layout
 from ._table_map import (
@@ -89,7 +90,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
     table = tables[0]  # other columns are on its clock
     imus = {each.topic: _imu(columns, each, place) for each in tables}
     used = {c for each in tables for c in (each.time, each.counter, each.accel_time, *each.gyro, *each.accel)}
-    poses = _truth(columns, table, path, place, remarks)
+    poses = _truth(columns, table, path, place, remarks, imus[table.topic])
     group = next((g for g in (POSES_GROUP, TRUTH_GROUP) if g in columns.sources), "") if path.is_dir() else ""
     if not poses and (group or "pose_kind" in given):
         remarks.losses.append(f"{columns.sources.get(group, path.name)} gives no poses: {why_no_poses(columns, group)}")
@@ -217,7 +218,9 @@ def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
     return imu
 
 
-def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: Remarks) -> dict[str, Poses]:
+def _truth(
+    columns: Columns, table: TableMap, path: Path, where: Path, remarks: Remarks, imu: Imu
+) -> dict[str, Poses]:
     """True poses, where the map names them: in the table, or in a file next to it."""
     if not (table.quaternion_wxyz or table.rotation_matrix or table.roll_pitch_yaw):
         return {}
@@ -233,11 +236,15 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
         p = vectors_named(columns, table.position, POSITION_SI[table.position_unit], 0.0, where)
     if not len(t_ns) == len(q_wxyz) == len(p):
         raise ConfigError(f"the truth has {len(t_ns)} times, {len(q_wxyz)} rotations and {len(p)} positions", where=where)
-    if table.pose_world == "ned":
-        p, q_wxyz = p[:, [1, 0, 2]] * [1.0, 1.0, -1.0], quaternion.multiply(quaternion.NED_FROM_ENU, q_wxyz)
     topic = POSES_TOPIC if table.pose_kind == "truth" else f"/{table.pose_kind}/pose"
     known, notes = known_rotations(q_wxyz, topic)
-    kept = in_order(t_ns[known], np.concatenate([p, q_wxyz], axis=1)[known], topic)
+    t_ns, p, q_wxyz = t_ns[known], p[known], q_wxyz[known]
+    if table.pose_world == "ned":
+        p, q_wxyz = p[:, [1, 0, 2]] * [1.0, 1.0, -1.0], quaternion.multiply(quaternion.NED_FROM_ENU, q_wxyz)
+    else:
+        p, q_wxyz, said = to_east_north_up(t_ns, p, q_wxyz, imu)
+        notes += said
+    kept = in_order(t_ns, np.concatenate([p, q_wxyz], axis=1), topic)
     remarks.notes.extend(notes + kept.notes)
     if not len(kept.t_ns):
         return {}
