@@ -61,8 +61,8 @@ def sequences_below(source: Path) -> list[Sequence]:
     find_folders(source, is_mine, lambda folder: found[folder][0].path.is_dir())  # whose folders may be sensors of it
     sequences = [*chain(*found.values())]
     others = [folder for folder, own in found.items() if sequences and not own and folder not in parts]
-    names = ((path.parent, re.sub(SPACED, "_", path.parent.name).lower(), path) for each in others for path in _tables(each))
-    if true := [f"{folder.name}/{path.name}" for folder, name, path in names if re.fullmatch(POSES, name)]:
+    named = [each for each in others if re.fullmatch(rf"{POSES}|(.*_)?poses?", re.sub(SPACED, "_", each.name).lower())]
+    if true := [f"{path.parent.name}/{path.name}" for each in named for path in _tables(each) or _arrays(each)]:
         note = f"tables of true poses in a folder without an IMU are left out: {_listed(true)}"
         logger.warning("%s: %s. Put each next to the tables of its IMU, with ground_truth in its name", source, note)
     return sequences

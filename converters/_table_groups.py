@@ -91,7 +91,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     for shared, named_true, leaves in () if entries.keys() & TURNS else _bodies(columns, time, unit):
         clock = (named_true and shared[0] == time and _own_time(columns, leaves, time, unit)) or shared
         bodies = bodies_of(leaves)
-        for body in (leaves, *bodies):
+        for body in (leaves, *bodies) if position_of(leaves) else (*bodies, leaves):
             position = position_of(body)
             turns = _turns(columns, entries, body, clock, reasons) if position or named_true or clock[0] != time else {}
             if turns:

@@ -14,7 +14,7 @@ TRUE_GROUPS = (
 )
 TRUE_BEHIND = r"((?<=^q)|_)(mocap|vicon|opti_?track|omc|qualisys|leica|ground_?truth|truth|true|gt)(_?ref(erence)?)?(?=_|$)"
 FRAMES = r"(_[a-z]{2})?"  # of a rotation or a position, as in q_wb, R_wb, p_wb
-ROTATION = rf"(q|quat|quaternion|orient|orientation|rotation|attitude|ori|rot){FRAMES}_?"
+ROTATION = rf"(q|quats?|quaternions?|orient|orientations?|rotations?|attitudes?|ori|rot){FRAMES}_?"
 QUATERNION = rf"{ROTATION}(?P<axis>[wxyz])"
 QUATERNION_ARRAY = rf"(.*_)?{ROTATION}(?P<axis>[0-4])"  # from 0, or as MATLAB counts
 COMMANDED = r"(.*_)?(des|desired|sp|set_?point|cmd|command|target|ref|reference|demand|err|error)_"
@@ -24,7 +24,7 @@ ANGLES = (
 )
 GREEK = {"phi": "roll", "theta": "pitch", "psi": "yaw"}
 HEADING = r"((compass|true|magnetic)_)?(heading|azimuth)"  # a yaw
-POSITION = r"((t|p|(processed_?)?pos|position|translation|trans|[pr]_[a-z]{2}(_[a-z]{1,2})?)_?)?(?P<axis>[xyz012])"
+POSITION = r"((t|p|(processed_?)?pos|positions?|translations?|trans|[pr]_[a-z]{2}(_[a-z]{1,2})?)_?)?(?P<axis>[xyz012])"
 POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (POSITION, "xyz"),
     (r"(p(os(ition)?)?_?)?(?P<axis>east|north|up)", ("east", "north", "up")),
@@ -38,7 +38,7 @@ NED = POSITIONS[2:-3]
 MATRIX = rf"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r|c){FRAMES}_?(?P<axis>[0-3][0-3]|\d)"  # or Rot[8]
 OWNED = (  # columns of a body's poses: ABBquaternion[0], robot_qw, tool_x
     rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+?)_?"
-    r"(?P<leaf>(quat|quaternion|orientation|rotation|attitude|pos|position|translation)_?[wxyz0-3])",
+    r"(?P<leaf>(quats?|quaternions?|orientations?|rotations?|attitudes?|pos|positions?|translations?)_?[wxyz0-3])",
     rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+)_(?P<leaf>((q|t|p|ori|rot|trans)_?)?[wxyz0-3])",
 )
 NOT_ALIKE = "do not turn as the gyro does"

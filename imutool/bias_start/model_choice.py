@@ -291,6 +291,6 @@ def _no_start(where: str | Location) -> ModelError:
         "the log holds no stretch at rest to measure a static bias on",
         where=where,
         expected="a trained `model`, or at least 1.5 s without motion",
-        fix="Give `model` (imutool models lists those that ship), or train one with imutool train; if imutool info finds "
-        "other units, correct them first with imutool convert LOG OUT --fix",
+        fix="Give `model` (imutool models lists those that ship), or train one with imutool train; true poses show the bias, "
+        "too: `init` truth; if imutool info finds other units, correct them first with imutool convert LOG OUT --fix",
     )

@@ -289,23 +289,26 @@ def test_a_file_with_arrays_of_different_lengths_beside_tables_is_left_out(tmp_p
 
 
 @pytest.mark.parametrize("suffix", ["", ".npy"])
-def test_a_folder_of_arrays_for_each_sensor_is_a_table_for_each(tmp_path, suffix):
-    """Arrays are known by their first bytes: comma2k19 has them in files without a suffix."""
+def test_a_folder_of_arrays_for_each_sensor_is_a_table_for_each(tmp_path, caplog, suffix):
+    """Arrays are known by their first bytes: comma2k19 has them in files without a suffix, and its poses apart."""
     turn = GYRO + TURN[:, None]  # so that gravity shows the unit
     arrays = {
         "gyro": {"t": T_S, "value": np.asfortranarray(turn)},
         "gyro_bias": {"t": T_S, "value": 0.0 * turn},
         "accelerometer": {"t": T_S, "value": ACCEL},
         "magnetometer": {"t": T_S[::10], "value": turn[::10]},
+        "../global_pose": {"frame_times": T_S[::10], "frame_positions": ACCEL[::10]},
     }
     for sensor, files in arrays.items():
-        (tmp_path / "drive" / "IMU" / sensor).mkdir(parents=True)
+        (folder := tmp_path / "drive" / "IMU" / sensor).mkdir(parents=True)
         for name, values in files.items():
-            with (tmp_path / "drive" / "IMU" / sensor / f"{name}{suffix}").open("wb") as file:
+            with (folder / f"{name}{suffix}").open("wb") as file:
                 np.save(file, values)
     (tmp_path / "drive" / "IMU" / "gyro" / "notes").write_text("no array")
     (sequence,) = table.sequences(tmp_path)
     assert sequence.name == "IMU"
+    (told,) = [line.getMessage() for line in caplog.records]
+    assert f"global_pose/frame_positions{suffix}. Put each next to the tables of its IMU" in told
     log = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"})
     np.testing.assert_array_equal(log.imus["/imu0"].gyro, turn)
     np.testing.assert_array_equal(log.imus["/imu0"].accel, ACCEL)

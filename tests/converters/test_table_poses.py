@@ -267,6 +267,18 @@ def test_positions_state_their_unit_at_the_end_of_their_names(tmp_path, names, s
     np.testing.assert_allclose(poses.p_wb, P_M, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["positions,orientations", "translations,quats", "frame_positions,frame_quaternions"])
+def test_arrays_of_poses_may_have_names_in_the_plural(tmp_path, kind):
+    """As Python programs name them; those of comma2k19 are of a frame."""
+    (tmp_path / "imu.csv").write_text(imu_text())
+    arrays = dict(zip(["times", *kind.split(",")], (T_S[::5], P_M[::5], XYZW[::5]), strict=True))
+    np.savez(tmp_path / "ground_truth.npz", **arrays)
+    (sequence,) = table.sequences(tmp_path)
+    poses = table.read_sequence(sequence).poses["/ground_truth/pose"]
+    np.testing.assert_allclose(poses.p_wb, P_M[::5])
+    np.testing.assert_allclose(poses.q_wb_wxyz[:, [1, 2, 3, 0]], XYZW[::5], atol=1e-12)
+
+
 def test_a_map_that_names_rotations_alone_takes_the_time_beside_them(tmp_path):
     names = [f"u{n}" for n in range(4)]
     (tmp_path / "gt.csv").write_text("time,x,y,z," + ",".join(names) + "\n" + rows(T_S[::2], P_M[::2], XYZW[::2]))
