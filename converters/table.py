@@ -218,9 +218,7 @@ def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
     return imu
 
 
-def _truth(
-    columns: Columns, table: TableMap, path: Path, where: Path, remarks: Remarks, imu: Imu
-) -> dict[str, Poses]:
+def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: Remarks, imu: Imu) -> dict[str, Poses]:
     """True poses, where the map names them: in the table, or in a file next to it."""
     if not (table.quaternion_wxyz or table.rotation_matrix or table.roll_pitch_yaw):
         return {}
