@@ -120,7 +120,7 @@ def load_split(folder: Path, recording: str) -> Columns:
             verb = "are" if group == POSES_GROUP else "is"
             part.remarks.notes.append(f"the {group.replace('_', ' ')} {verb} {path.name}")
         name_columns(part, sensor)
-        if group == TRUTH_GROUP:
+        if group == TRUTH_GROUP or (path not in groups and look(path).has_turns):  # a GNSS/INS
             add_local(part)
         whole.take(group, part, path.name)
     _count_rows(whole)

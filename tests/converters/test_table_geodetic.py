@@ -31,8 +31,11 @@ def rows(*values: np.ndarray) -> str:
     return "".join(",".join(map(repr, row)) + "\n" for row in np.column_stack(values).tolist())
 
 
-def recorded(folder: Path, unit: str, down: float, head: str = "latitude [{0}],longitude [{0}],altitude [m]") -> MessageLog:
-    """Log of an IMU next to true angles; `down` is 1 where the z axis of their world points down."""
+STATED = "latitude [{0}],longitude [{0}],altitude [m]"
+
+
+def recorded(folder: Path, unit: str, down: float, head: str = STATED, name: str = "groundtruth") -> MessageLog:
+    """Log of an IMU next to angles of another table; `down` is 1 where the z axis of their world points down."""
     rotation = Rotation.from_euler("ZYX", ANGLES[:, ::-1])
     turns = (rotation[:-1].inv() * rotation[1:]).as_rotvec() * 100.0
     force = rotation.inv().apply([0.0, 0.0, -9.81 * down])
@@ -44,17 +47,15 @@ def recorded(folder: Path, unit: str, down: float, head: str = "latitude [{0}],l
     wrapped = (longitude + np.pi) % (2.0 * np.pi) - np.pi
     truth = [T_S, latitude * size, wrapped * size, HEIGHT_M - NED[:, 2], *ANGLES.T * 180.0 / np.pi]
     names = f"time [s],{head.format(unit)},roll [deg],pitch [deg],yaw [deg]\n"
-    (folder / "groundtruth.csv").write_text(names + rows(*(column[EVERY] for column in truth)))
+    (folder / f"{name}.csv").write_text(names + rows(*(column[EVERY] for column in truth)))
     (sequence,) = table.sequences(folder)
     return table.read_sequence(sequence)
 
 
-STATED = "latitude [{0}],longitude [{0}],altitude [m]"
-
-
+@pytest.mark.parametrize("name", ["groundtruth", "gnss_ins"])
 @pytest.mark.parametrize(("unit", "head"), [("deg", STATED), ("rad", STATED), ("deg", "lat_{0},lon_{0},height_m")])
-def test_latitude_longitude_and_height_are_positions_of_true_angles(tmp_path, unit, head):
-    poses = recorded(tmp_path / "ship", unit, 1.0, head).poses["/ground_truth/pose"]
+def test_latitude_longitude_and_height_are_positions_of_the_angles_beside_them(tmp_path, unit, head, name):
+    (poses,) = recorded(tmp_path / "ship", unit, 1.0, head, name).poses.values()
     latitude, longitude = LATITUDE + NED[:, 0] / 6.37e6, LONGITUDE + NED[:, 1] / (6.39e6 * np.cos(LATITUDE))
     place = ecef(latitude, longitude, HEIGHT_M - NED[:, 2])[EVERY]
     sin, cos = np.sin([LATITUDE, LONGITUDE]), np.cos([LATITUDE, LONGITUDE])
