@@ -50,6 +50,8 @@ def add_local(columns: Columns) -> None:
             columns.values[f"{LOCAL}{axis} [m]"] = each
         note = f"{LOCAL}north, {LOCAL}east and {LOCAL}down are {latitude}, {longitude} and {height} about their first"
         columns.remarks.notes.append(f"{note}, in m; the angles are taken for {unit}")
+    elif not unit:
+        columns.remarks.notes.append(f"{latitude} and {longitude} state neither deg nor rad: no positions are made of them")
 
 
 def in_their_world(columns: Columns, entries: Entries, position: list[str], clock: tuple[str, str]) -> tuple[list[str], str]:

@@ -78,7 +78,7 @@ def test_angles_in_another_world_keep_no_positions_of_this_one(tmp_path):
 def test_small_angles_without_a_unit_are_no_positions(tmp_path):
     log = recorded(tmp_path / "car", "rad", 1.0, "lat,lon,alt")
     assert not log.poses["/ground_truth/pose"].p_wb.any()
-    assert not any("local_north" in note for note in log.remarks.notes)
+    assert any("lat and lon state neither deg nor rad" in note for note in log.remarks.notes)
 
 
 @pytest.mark.parametrize("head", ["latitude [deg],longitude [deg],altitude [m]", "easting,northing,height"])
