@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from imutool.diagnosis.audit.bandwidth import max_filter_delays
@@ -31,6 +32,10 @@ from imutool.units import AXES, SENSORS
 BY_RECORDING = ("body_centre", "clipping_absent", "digits_absent", "bandwidth_absent")
 MIN_ARM_M = 0.02  # of the recording's sensor from its poses' point
 TIMING = ("backward_difference", "step_delay", "early_stamps")
+BY_POSITIONS = (
+    *("coordinate_acceleration", "gravity_doubled", "gravity_sign", "gravity_only", "transport_term", "lever_arm"),
+    "other_clock",
+)
 BY_NOISE = ("noise_absent", "noise_per_sample", "noise_density")
 
 
@@ -77,6 +82,8 @@ def audit(
     except DataError as error:
         raise error.at(sim) from error
     not_tested = dict(_not_tested(recording, sheet))
+    if not simulated.truth.has_positions:
+        not_tested |= dict.fromkeys(BY_POSITIONS, "the poses have no positions, which the accelerometer needs")
     if unknown_lines and not any(fault.fault == "step_lines" for fault in faults):
         at = " and ".join(f"{line.f_hz:.4g} Hz ({line.sensor})" for line in unknown_lines)
         not_tested["step_lines"] = (
@@ -108,10 +115,15 @@ def _faults(
     expected = [Expected.of_sheet(sheet)] if _has_noise(sheet) else []
     expected += [] if real is None else [Expected.of_recording(real.imu)]
     motion_left = unexplained(moved, fit, by_motion)
+    if not sim.truth.has_positions:  # zeros stand for them: of the accelerometer they show nothing
+        known = (f for f in by_motion if f.fault == "wrong_unit" or (f.signal != "accel" and f.fault not in BY_POSITIONS))
+        by_motion = [msgspec.structs.replace(f, signal="gyro") if f.signal == "both" else f for f in known]
+        motion_left.pop("accel", None)
     if motion_left:  # of what is no motion of the body no delay can be told
         by_motion = [fault for fault in by_motion if fault.fault not in TIMING or fault.signal not in (*motion_left, "both")]
     arm = np.array([fit.estimates[axis].value for axis in AXES])
     lines_found = spectral_lines(samples, fit.residual, rate_hz, *by_differences(sim.truth, arm))
+    lines_found = [line for line in lines_found if sim.truth.has_positions or line.sensor == "gyro"]
     faults, unknown_lines = noise_faults(sim.imu, fit.residual, expected, lines_found)
     if any(fault.fault == "repeated_samples" for fault in faults):  # which are late by half of the physics step
         by_motion = [fault for fault in by_motion if fault.fault not in TIMING[:2]]

@@ -78,6 +78,19 @@ def test_a_delay_of_a_part_of_a_sample_period_is_a_step_of_the_physics(late: flo
     assert fault.parameters["delay"].value == pytest.approx(late * period_s, rel=0.03)
 
 
+@pytest.mark.parametrize(("name", "expected"), [("null", set()), ("euler_rates", {"euler_rates"})])
+def test_poses_without_positions_show_the_gyro_alone(tmp_path: Path, name: str, expected: set[str]) -> None:
+    """Zeros stand for the positions, and the body would not move."""
+    sim, _, _ = bench.made(name, 5, DURATION_S)
+    poses = sim.truth
+    turns = replace(sim, truths={next(iter(sim.truths)): Poses(poses.t_ns, 0.0 * poses.p_wb, poses.q_wb_wxyz)})
+    write(turns, tmp_path / "sim.mcap")
+    report = audit(tmp_path / "sim.mcap")
+    assert {fault.fault for fault in report.faults if not fault.fault.startswith("noise")} == expected
+    assert report.not_tested["lever_arm"].startswith("the poses have no positions")
+    assert "accel" not in report.unexplained
+
+
 def test_what_poses_do_not_follow_is_no_lever_arm() -> None:
     """A foot that strikes the ground shakes the body about another point, faster than smoothed poses show."""
     sim, _, _ = bench.made("null", 5, DURATION_S)
