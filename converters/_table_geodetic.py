@@ -1,4 +1,4 @@
-"""Latitude, longitude and height of true poses, as metres north, east and down; and poses about the centre of the Earth.
+"""Latitude, longitude and height, or ECEF, of true poses, as metres along local axes.
 
 In a plane about the first: north is (M + h) dlat and east (N + h) cos(lat) dlon, with the radii M and N of the ellipsoid there
 (WGS 84; Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, eq. 2.105, 2.106 and 2.111). A

@@ -240,8 +240,8 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
     if table.pose_world == "ned":
         p, q_wxyz = p[:, [1, 0, 2]] * [1.0, 1.0, -1.0], quaternion.multiply(quaternion.NED_FROM_ENU, q_wxyz)
     else:
-        p, q_wxyz, said = to_east_north_up(t_ns, p, q_wxyz, imu)
-        notes += said
+        p, q_wxyz, added = to_east_north_up(t_ns, p, q_wxyz, imu)
+        notes += added
     kept = in_order(t_ns, np.concatenate([p, q_wxyz], axis=1), topic)
     remarks.notes.extend(notes + kept.notes)
     if not len(kept.t_ns):
