@@ -268,8 +268,8 @@ def check_trainable(recordings: Sequence[Recording], pool: Pool) -> None:
     rates = pool.gyro[first[:, None] + torch.arange(n)].mean(1)  # noise is no motion
     turning = float((rates - rates.mean(0)).norm(dim=1).quantile(TURNING))
     if turning < MIN_TURN_RAD_S:
-        what = f"the sensor stands still: {TURNING:.0%} of the time it turns by less than {turning:.3f} rad/s"
-        expected = f"motion, more than {MIN_TURN_RAD_S:g} rad/s"
+        what = f"the sensor hardly turns: {TURNING:.0%} of the time by less than {turning:.3f} rad/s"
+        expected = f"turns of more than {MIN_TURN_RAD_S:g} rad/s"
         fix = "Add logs in which it turns; for a sensor at rest, imutool debias needs no model"
         raise DataError(what, where=", ".join(pool.names), expected=expected, fix=fix)
     _truths_follow(pool, first, n)
