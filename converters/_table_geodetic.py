@@ -101,7 +101,7 @@ def to_east_north_up(
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 4"], list[str]]:
     """Poses about the centre of the Earth in east, north, up, and a note; others as they are.
 
-    The rotations stay if the IMU's gravity shows that their world has z up, and not the axes of the Earth.
+    The IMU's gravity is away from the centre in the world of their rotations. Northings of UTM may be as large.
     """
     if not len(p) or not FROM_CENTRE_M[0] < np.linalg.norm(middle := np.median(p, axis=0)) < FROM_CENTRE_M[1]:
         return p, q_wxyz, []
@@ -110,11 +110,9 @@ def to_east_north_up(
     east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
     up = np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
     R_enu_ecef = np.stack([east, np.cross(up, east), up])
-    note = "the positions count from the centre of the Earth (ECEF): they are east, north, up about the first in the log"
     force = interpolate((t_ns - imu.t_ns[0]) * 1e-9, (imu.t_ns - imu.t_ns[0]) * 1e-9, imu.accel)
     mean = np.nanmean(quaternion.rotate(q_wxyz, force), axis=0)
-    shares = [float(mean @ each) / float(np.linalg.norm(mean)) for each in (up, [0.0, 0.0, 1.0])]
-    p = (p - p[0]) @ R_enu_ecef.T
-    if shares[1] > max(UP, shares[0]):
-        return p, q_wxyz, [f"{note}; the rotations stay, whose world has +z up"]
-    return p, quaternion.multiply(quaternion.of_matrix(R_enu_ecef), q_wxyz), [f"{note}, and so are the rotations"]
+    if not float(mean @ up) > UP * float(np.linalg.norm(mean)):
+        return p, q_wxyz, []
+    note = "the poses count from the centre of the Earth (ECEF): they are east, north, up about the first in the log"
+    return (p - p[0]) @ R_enu_ecef.T, quaternion.multiply(quaternion.of_matrix(R_enu_ecef), q_wxyz), [note]
