@@ -40,6 +40,7 @@ from imutool.mcap_io.repair import repaired
 from imutool.mcap_io.rewrite import RewriteReport, Values, rewrite
 from imutool.mcap_io.verify import Verified, check_mode
 from imutool.recording import seconds
+from imutool.report import json_values
 
 SUFFIX, CLEAN_RECORD = "/debiased", "imutool_clean"
 DEBIASED_BY = "debiased_by"  # in the record `imutool`: the log's own IMU is a debiased one, from `imutool.debias` of arrays
@@ -260,7 +261,7 @@ def _debias(
 
         def metadata(verified: Verified) -> Values:
             origin = {"source_file": source.name, "source_size": str(source.stat().st_size), **digest.result()}
-            origin["verified"] = json.dumps(verified._asdict())
+            origin["verified"] = json.dumps(json_values(verified))
             entries = {_record_name("imutool", t, records): v | origin | sieves[t].record() for t, v in records.items()}
             return entries | {_record_name(CLEAN_RECORD, topic, records): found.record() for topic, found in surveys.items()}
 

@@ -28,15 +28,15 @@ __all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", 
 
 # by name, the module and the type: imported when its schema is asked for, so that --help stays light
 REPORTS = {
-    "catalog": "imutool.cli.fleet_view:CatalogReport",
+    "catalog": "imutool.fleet.rerun_catalog:CatalogReport",
     "audit": "imutool.diagnosis.audit:AuditReport",
     "clean": "imutool.cleaning.survey:CleaningReport",
-    "conversion": "imutool.cli.convert:Conversion",
+    "conversion": "imutool.conversion.workers:ConvertReport",
     "debias": "imutool.cli.debias:DebiasSummary",
     "demo": "imutool.cli.demo:DemoReport",
     "diagnosis": "imutool.diagnosis.result:DiagnosisReport",
     "evaluation": "imutool.cli.evaluate:Evaluation",
-    "export": "imutool.cli.convert:Export",
+    "export": "imutool.exporting:ExportReport",
     "fleet": "imutool.fleet.results:FleetSummary",
     "fleet-diagnosis": "imutool.fleet.robots:FleetDiagnosis",
     "info": "imutool.log_info.report:LogInfo",
@@ -119,7 +119,8 @@ def json_schema(name: str) -> dict[str, Any]:
     Raises:
         ConfigError: no report has this name; the message names the nearest.
     """
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **msgspec.json.schema(report_type(name))}
+    schema = msgspec.json.schema(report_type(name), schema_hook=lambda kind: {"type": "string"})  # of a path: `_plain`
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
 def _plain(value: Any) -> Any:

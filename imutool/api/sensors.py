@@ -10,6 +10,7 @@ import msgspec
 
 from imutool import diagnosis_output
 from imutool.api import NamedProgress, checked, given_logs
+from imutool.diagnosis.diagnose import ComparedLogs
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.second_simulation import along_samples
 from imutool.file_location import LogPath, local, several
@@ -150,13 +151,9 @@ def diagnose(
         inputs = logs.places + sims.places
         check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], inputs, overwrite=overwrite)
         return diagnosis_output.diagnose(
-            logs.places,
-            next(iter(sims.places), None),
+            ComparedLogs(logs.places, next(iter(sims.places), None), imu, truth, several(signals)),
             folder,
             names=logs.names | sims.names,
-            imu=imu,
-            truth=truth,
-            signals=several(signals),
             close=close,
             metric=metric,
             overwrite=overwrite,

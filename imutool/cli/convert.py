@@ -12,10 +12,8 @@ from imutool.cli.app import COMMON, Common, Written, app, listing
 from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import say, tell_error, tell_warning
 from imutool.config import entries
-from imutool.conversion import Failure
 from imutool.errors import LOST, DataError
 from imutool.mcap_io.storage.local import is_stream
-from imutool.report import Report
 
 if TYPE_CHECKING:
     from imutool.conversion.workers import ConvertReport
@@ -30,25 +28,6 @@ class Compression(StrEnum):
     zstd = "zstd"
     lz4 = "lz4"
     none = "none"
-
-
-class Conversion(Report, frozen=True, tag="imutool.conversion/1"):
-    """Report of `imutool convert`."""
-
-    written: list[str]
-    failures: list[Failure]
-    notes: list[str]
-    losses: list[str]
-
-
-class Export(Report, frozen=True, tag="imutool.export/1"):
-    """Report of `imutool export`: messages or rows by file, and the topics left out."""
-
-    output: str
-    format: str
-    imu: str | None
-    written: dict[str, int]
-    left_out: list[str]
 
 
 @app.command(
@@ -113,8 +92,7 @@ def _mapping(words: list[str]) -> Path | dict[str, Any] | None:
 
 def _tell(report: ConvertReport, common: Common) -> None:
     """Report written logs, notes, losses and failures; the exit code says which there are."""
-    summary = Conversion([str(path) for path in report.written], report.failures, report.notes, report.losses)
-    if not common.write(summary):
+    if not common.write(report):
         for path in report.written:
             say(str(path))
     if not common.quiet:
@@ -167,8 +145,7 @@ def export(
 
     with common.progress("Exporting") as tell:
         report = run(log, target, format=format, imu=imu, noise=noise, overwrite=common.overwrite, progress=tell)
-    summary = Export(str(report.output), report.format, report.imu, report.written, report.left_out)
-    if common.write(summary):
+    if common.write(report):
         return
     counts = ", ".join(name if "." in name else f"{count} on {name}" for name, count in report.written.items())
     say(f"{target}: {counts}" + (f"; IMU from {report.imu}" if report.imu else ""))

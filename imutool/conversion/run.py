@@ -15,11 +15,20 @@ from types import ModuleType
 from typing import Any
 
 from imutool import registry
-from imutool.conversion import Failure
 from imutool.conversion.corrections import CONVENTIONS, STAMPS
 from imutool.conversion.unread_formats import blamed, is_pointer, left_out_below, nothing_found, pointers_in
 from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
-from imutool.conversion.workers import GROUP, SUFFIX, ConvertReport, Job, Progress, check_targets, run_jobs, write_content
+from imutool.conversion.workers import (
+    GROUP,
+    SUFFIX,
+    ConvertReport,
+    Failure,
+    Job,
+    Progress,
+    check_targets,
+    run_jobs,
+    write_content,
+)
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
 from imutool.file_location import local
 from imutool.mcap_io.storage.local import is_stream, removed_if_empty
@@ -142,7 +151,7 @@ def _convert_found(
     pointers = pointers_in(source) if errors else []
     if len(names) == 1 and failed:
         raise blamed(failed[0][1], pointers)
-    report = ConvertReport(failures=[Failure(name, str(blamed(error, pointers))) for name, error in errors])
+    report = ConvertReport([], [Failure(name, str(blamed(error, pointers))) for name, error in errors], [], [])
     for number, outcome in sorted(outcomes.items()):
         if outcome.error is None:
             report.add(jobs[number].target, outcome)
@@ -272,7 +281,7 @@ def _from_stream(
     first = list(islice(recordings, 2))
     if not first:
         raise DataError("no sequence found", where=source, expected=" or ".join(wanted) or "at least one")
-    report = ConvertReport()
+    report = ConvertReport([], [], [], [])
     for recording in chain(first, recordings):
         (target,) = _targets([recording.name], out, many=len(first) > 1)
         if target in report.written:

@@ -11,7 +11,6 @@ from typing import Any
 
 from imutool import registry
 from imutool.config import toml
-from imutool.conversion import Failure
 from imutool.conversion.common_setup import most_alike, shared
 from imutool.conversion.correction_rounds import write_corrected
 from imutool.conversion.corrections import Corrections
@@ -30,6 +29,7 @@ from imutool.mcap_io.write import write
 from imutool.processes.worker_pool import WorkerBugError, WorkerPool
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
+from imutool.report import Report, Section
 
 GROUP = "imutool.converters"
 SUFFIX = ".mcap"
@@ -57,6 +57,13 @@ class Job:
     note: str = ""  # on the job itself
 
 
+class Failure(Section, frozen=True):
+    """Failed sequence, with the reason."""
+
+    name: str
+    message: str
+
+
 @dataclass(frozen=True)
 class Outcome:
     """Outcome of a job: its error, or remarks on what was written."""
@@ -68,14 +75,13 @@ class Outcome:
     mapping: Mapping[str, str] = field(default_factory=dict)  # of a table: what its columns were taken for
 
 
-@dataclass(frozen=True)
-class ConvertReport:
+class ConvertReport(Report, frozen=True, tag="imutool.conversion/1"):
     """Written logs, in the order of the source, and failures."""
 
-    written: list[Path] = field(default_factory=list)
-    failures: list[Failure] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)  # what is worth knowing about a log
-    losses: list[str] = field(default_factory=list)  # what of a source is not in its log
+    written: list[Path]
+    failures: list[Failure]
+    notes: list[str]  # what is worth knowing about a log
+    losses: list[str]  # what of a source is not in its log
 
     def add(self, target: Path, outcome: Outcome) -> None:
         """Enter a written log and the remarks on it."""

@@ -19,7 +19,7 @@ from imutool.diagnosis.audit.simulation import imu_in, read_simulation
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
-from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
@@ -66,6 +66,20 @@ NEEDS_SIMULATION = "gyro_dead_band"  # a zero crossing takes milliseconds, beyon
 Tell = Callable[[int, int, str], None]
 
 
+def _silent(done: int, total: int, text: str) -> None: ...
+
+
+class ComparedLogs(NamedTuple):
+    """Recordings and a simulation (None for their own poses), what is compared in them, and settings."""
+
+    reals: Sequence[Location]
+    sim: Location | None = None
+    imu: str | None = None
+    truth: str | None = None
+    signals: Sequence[str] = ()
+    settings: DiagnoseSettings = DEFAULT
+
+
 def diagnose(
     reals: Sequence[Location],
     sim: Location | None = None,
@@ -74,7 +88,7 @@ def diagnose(
     truth: str | None = None,
     signals: Sequence[str] = (),
     tell: Tell | None = None,
-    settings: DiagnoseSettings | None = None,
+    settings: DiagnoseSettings = DEFAULT,
     begin: Sequence[Finding] = (),
 ) -> Diagnosis:
     """Effects that separate recordings from a simulation, or from their own true poses.
@@ -87,7 +101,7 @@ def diagnose(
         ConfigError, LogError: a log cannot be read, or has no such topic; signals without a simulation, or of several logs.
         DataError: no truth and no simulation, too little shared time, another motion, no usable axis, different sensors.
     """
-    report, settings = tell or (lambda done, total, text: None), settings or DiagnoseSettings()
+    report, asked = tell or _silent, ComparedLogs(reals, sim, imu, truth, signals, settings)
     report(0, 4, "reading")
     check_signals(signals, reals, sim)
     topics = imu_topics(reals[0])
@@ -103,7 +117,7 @@ def diagnose(
         diagnosis = check_without_reference(recordings[0], str(reals[0]), "no simulation and no true poses", settings)
     else:
         remarks_read = [*(log.remark for log in logs_read if log.remark), *(wrong if sim is None else ())]
-        diagnosis, _ = _beside_reference(recordings, reals, sim, imu, truth, signals, remarks_read, report, settings, begin)
+        diagnosis, _ = _beside_reference(asked, recordings, remarks_read, report, begin)
     if others and first is not None:
         diagnosis = _with_other_imus(diagnosis, recordings[0], reals[0], first, others, settings)
     report(4, 4, "")
@@ -111,28 +125,27 @@ def diagnose(
 
 
 def _beside_reference(
+    asked: ComparedLogs,
     recordings: Sequence[Recording],
-    reals: Sequence[Location],
-    sim: Location | None,
-    imu: str | None,
-    truth: str | None,
-    signals: Sequence[str],
-    remarks_read: Sequence[str],
-    report: Tell,
-    settings: DiagnoseSettings,
-    begin: Sequence[Finding],
+    remarks_read: Sequence[str] = (),
+    report: Tell = _silent,
+    begin: Sequence[Finding] = (),
 ) -> tuple[Diagnosis, Selection | None]:
     """Diagnosis of recordings against a simulation or their own poses; `remarks_read` are those of reading them.
 
     The selection of effects comes with it; none without a reference.
     """
+    reals, sim, imu, truth, signals, settings = asked
     simulated = None if sim is None else read_simulation(sim, imu=imu_in(sim, imu))[0]
     warn_of_recordings([] if simulated is None else [simulated])
     of_sim, sim_selection, another = tuple[Finding, ...](), None, list[str]()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
         report(0, 4, "the simulation, of another motion")
         another = [ANOTHER_MOTION, *simulator_remarks(simulated)]
-        of_sim, sim_selection = _by_itself(sim, imu_in(sim, imu), next(iter(simulated.truths)), settings)
+        own = ComparedLogs([sim], None, imu_in(sim, imu), next(iter(simulated.truths)), (), settings)
+        of_itself = with_channels(read_log(sim, imu=own.imu, truth=own.truth), sim).recording
+        alone, sim_selection = _beside_reference(own, [of_itself])
+        of_sim = alone.findings
         simulated = None
     pairs, left_out = align_all(recordings, simulated, truth, settings)
     if not pairs:
@@ -168,15 +181,6 @@ def _beside_reference(
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
         diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings, clock_difference(pairs, selection.whole))
     return diagnosis, selection
-
-
-def _by_itself(
-    sim: Location, imu: str | None, truth: str, settings: DiagnoseSettings
-) -> tuple[tuple[Finding, ...], Selection | None]:
-    """Findings and selected effects of a simulation against its own poses."""
-    alone = [with_channels(read_log(sim, imu=imu, truth=truth), sim).recording]
-    diagnosis, selection = _beside_reference(alone, [sim], None, imu, truth, (), (), lambda *_: None, settings, ())
-    return diagnosis.findings, selection
 
 
 def _with_other_imus(

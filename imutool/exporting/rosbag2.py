@@ -38,7 +38,7 @@ def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport
         if identity(log) != before:  # the index and the bytes are of two logs
             raise LogError("changed while it was copied", where=log, fix="Wait until it is complete")
         (folder / "metadata.yaml").write_text(text, encoding="utf-8", newline="\n")
-    return ExportReport(out, "rosbag2", None, counts)
+    return ExportReport(out, "rosbag2", None, counts, [])
 
 
 def _check_readable(log: Log) -> None:

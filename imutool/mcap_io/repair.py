@@ -83,18 +83,12 @@ def repair(
     if same_location(source, target):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
     tell = progress or (lambda done, total: None)
-    with collector_paused(), _LogWithoutTopics(source, max_chunk=max_chunk) as log:
+    with collector_paused(), RecoveredLog(source, max_chunk=max_chunk, reads_topics=False) as log:
         try:
             return _copy_intact(log, target, overwrite, tell) or _repair(log, target, damaged, overwrite, tell)
         except _ContradictionError:
             log.read_by_records()
             return _repair(log, target, damaged, overwrite, tell)
-
-
-class _LogWithoutTopics(RecoveredLog):
-    """Damaged log whose topics nobody reads: they may have two types, and are saved as they are."""
-
-    def _read_topics(self) -> None: ...
 
 
 class _ContradictionError(Exception):

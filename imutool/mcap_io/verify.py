@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
-from typing import NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, DataEnd, MetadataIndex, SummaryOffset
@@ -22,11 +21,12 @@ from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.chunk_check import check_chunk
 from imutool.mcap_io.storage.source import crc_of
+from imutool.report import Section
 
 MODES = ("all", "imu", "none")
 
 
-class Verified(NamedTuple):
+class Verified(Section, frozen=True):
     """Checks made on a log: the mode, and how many of its chunks were unpacked."""
 
     mode: str
@@ -62,14 +62,8 @@ def verify(
     Raises:
         LogError: the log contradicts its own indexes, statistics or CRCs.
     """
-    with _LogWithoutTopics(path, max_chunk=max_chunk) as log, log.named():
+    with Log(path, max_chunk=max_chunk, reads_topics=False) as log, log.named():
         return verify_index(log.index, counts, unpacked=unpacked, progress=progress)
-
-
-class _LogWithoutTopics(Log):
-    """Log whose topics nobody reads."""
-
-    def _read_topics(self) -> None: ...
 
 
 def verify_index(

@@ -33,7 +33,7 @@ from imutool.sensor import physics_file
 from imutool.sensor.channels import channels_at, needs_channels, with_channels
 from imutool.sensor.effect import Acting, simulate_stretches
 from imutool.sensor.physics_file import PhysicsFile
-from imutool.sensor.physics_file_terms import additive_noise
+from imutool.sensor.physics_file_terms import SimulatedSensor, additive_noise
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.trajectory import SmoothMotion, smooth_motion
 
@@ -82,8 +82,7 @@ class Simulation:
         }
 
 
-# from a log, its pose topic, effects, the stamp from which they count, noise, rate and seed
-Along = Callable[[Path, str | None, Acting, int | None, noises.Noise, float | None, int], Simulation]
+Along = Callable[[Path, str | None, SimulatedSensor], Simulation]  # from a log and its pose topic
 
 
 def simulate(
@@ -111,14 +110,14 @@ def simulate(
     """
     report = progress or (lambda done, total, word: None)
     file = PhysicsFile() if physics is None else physics_file.read(physics)
-    acting = file.acting(where=physics or "physics")
-    sheet = noises.read(noise)
+    acting, sheet = file.acting(where=physics or "physics"), noises.read(noise)
+    sensor = SimulatedSensor(acting, file.start_ns, sheet, rate_hz, seed)
     if same_location(out, trajectory):
         raise ConfigError("is the trajectory itself", where=out, expected="another OUT")
     _check(rate_hz, seed)
     report(0, 2, "simulating")
     try:
-        simulation = (along or _along_poses)(trajectory, truth, acting, file.start_ns, sheet, rate_hz, seed)
+        simulation = (along or _along_poses)(trajectory, truth, sensor)
     except ImutoolError as error:
         raise error.at(trajectory) from error
     report(1, 2, "writing")
@@ -140,13 +139,11 @@ def simulate(
     return replace(simulation, recording=recording, settings=settings | {"output": str(out)}, remarks=remarks)
 
 
-def _along_poses(
-    path: Path, truth: str | None, acting: Acting, start_ns: int | None, noise: noises.Noise, rate_hz: float | None, seed: int
-) -> Simulation:
-    source = _source(path, truth, channels=needs_channels(acting))
+def _along_poses(path: Path, truth: str | None, sensor: SimulatedSensor) -> Simulation:
+    source = _source(path, truth, channels=needs_channels(sensor.acting))
     check_poses(source)
-    own_hz = 1.0 / source.imu.period_s if len(source.imu) > 1 else RATE_HZ
-    found = simulated(source, acting, noise, _rounded(own_hz) if rate_hz is None else rate_hz, seed, start_ns=start_ns)
+    rate_hz = sensor.rate_hz or _rounded(1.0 / source.imu.period_s if len(source.imu) > 1 else RATE_HZ)
+    found = simulated(source, sensor.acting, sensor.noise, rate_hz, sensor.seed, start_ns=sensor.start_ns)
     settings = {"truth": next(iter(source.truths)), "imu": None, **found.settings}
     return replace(found, recording=replace(found.recording, metadata=source.metadata), settings=settings)
 

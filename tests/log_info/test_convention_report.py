@@ -136,7 +136,7 @@ def test_a_diagnosis_says_in_its_remarks_what_is_wrong_with_the_samples(
     told: list[str] = []
 
     def begun(*given: Any) -> None:
-        told.extend(given[6])
+        told.extend(given[2])
         raise StopError
 
     monkeypatch.setattr("imutool.diagnosis.diagnose._beside_reference", begun)
