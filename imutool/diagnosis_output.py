@@ -34,7 +34,7 @@ from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.mcap_io.storage.target import Target, writing
 from imutool.noise import datasheet
 from imutool.processes.forked import Forked
-from imutool.report import json_text
+from imutool.report import NamedProgress, json_text, silent
 from imutool.sensor import physics_file
 from imutool.sensor.simulate import simulate
 
@@ -110,7 +110,7 @@ def diagnose(
     close: bool = False,
     metric: Callable[[Path], float] | None = None,
     overwrite: bool = False,
-    tell: Callable[[int, int, str], None] | None = None,
+    tell: NamedProgress = silent,
     names: Mapping[str, str] | None = None,
 ) -> tuple[Diagnosis, list[str]]:
     """Diagnosis of recordings, written to a folder if given; a remark for each file left out.
@@ -145,8 +145,7 @@ def diagnose(
         required("matplotlib.figure", DRAWN[1])  # once, here: each process that draws is a copy of this one
     drawn = Forked(partial(_drawings, look), idle=True)  # of the logs, while they are diagnosed, where time is left
     diagnosis = search(asked)
-    if tell is not None:
-        tell(0, 1, "writing")
+    tell(0, 1, "writing")
     remarks = write(diagnosis, folder, logs=look, drawn=drawn, overwrite=overwrite)
     if close:
         rewrite = partial(write, folder=folder, logs=look, overwrite=True)

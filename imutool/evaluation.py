@@ -140,7 +140,7 @@ def _evaluated(
     debiased: Imu | None,
     corrections: Iterable[Correction],
     wrong: Sequence[str],
-    how: Mapping[str, str | bool],
+    how: Mapping[str, object],
     aids: Aids | None,
     save: Callable[[str, Iterable[Poses]], None] | None,
 ) -> list[dict[str, Any]]:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
@@ -24,7 +24,8 @@ from msgspec import UNSET, UnsetType
 
 from imutool.errors import ConfigError, did_you_mean
 
-__all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", "json_text", "json_values", "report_type"]
+__all__ = ["REPORTS", "UNSET", "NamedProgress", "Progress", "Report", "Section", "UnsetType"]
+__all__ += ["json_schema", "json_text", "json_values", "report_type", "silent"]
 
 # by name, the module and the type: imported when its schema is asked for, so that --help stays light
 REPORTS = {
@@ -51,6 +52,14 @@ REPORTS = {
     "view": "imutool.cli.view:View",
     "vio": "imutool.cli.evaluate:VioReport",
 }
+
+
+Progress = Callable[[int, int], None]  # bytes done, bytes in all
+NamedProgress = Callable[[int, int, str], None]  # steps done, steps in all, the current step
+
+
+def silent(*_: object) -> None:
+    """Progress that nobody looks at."""
 
 
 class Section(msgspec.Struct, frozen=True):

@@ -6,9 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from imutool.api import NamedProgress, checked
+from imutool.api import checked
 from imutool.conversion import run as conversion
-from imutool.conversion.workers import ConvertReport
+from imutool.conversion.corrections import CONVENTIONS, STAMPS
+from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
+from imutool.conversion.workers import ConvertReport, Job
 from imutool.errors import ConfigError, DataError, LogError, did_you_mean
 from imutool.exporting import ExportReport, euroc, rosbag2, simulators
 from imutool.file_location import LogPath, local, location, several
@@ -21,6 +23,7 @@ from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.mcap_io.temperature import with_temperatures
 from imutool.mcap_io.write import write as write_log
 from imutool.recording import Recording
+from imutool.report import NamedProgress, silent
 
 FORMATS = ("euroc", "rosbag2", *simulators.FORMATS)
 
@@ -149,17 +152,22 @@ def convert(
         ['flight_1.mcap', 'flight_2.mcap']
     """
     check_outputs([OutputFile("out", out, files=("*.mcap",), keeps=True)], [source], overwrite=overwrite)
-    options: dict[str, Any] = {"compression": compression, "images": images, "overwrite": overwrite, "workers": workers}
-    marks: dict[str, Any] = {"sensor": sensor, "kinds": several(kinds), "imu": imu, "fix": fix, "restamp": restamp}
+    template = Job(
+        compression=compression,
+        images=images,
+        overwrite=overwrite,
+        labels=Labels(sensor, parse_kinds(several(kinds)), parse_pair(imu)),
+        mapping=mapping if mapping is None or isinstance(mapping, Mapping) else local(mapping, "mapping"),
+        correct=tuple(name for name, asked in ((CONVENTIONS, fix), (STAMPS, restamp)) if asked),
+    )
     return conversion.convert(
         local(source, "source"),
         f"{local(out, 'out')}/" if str(out).endswith("/") else local(out, "out"),
+        template,
         format=format,
         sequences=several(sequences),
-        mapping=mapping if mapping is None or isinstance(mapping, Mapping) else local(mapping, "mapping"),
+        workers=workers,
         progress=progress,
-        **options,
-        **marks,
     )
 
 
@@ -226,7 +234,7 @@ def export(
         raise ConfigError(f"unknown format {format!r}", where="format", expected=" or ".join(FORMATS), fix=fix)
     source, folder = local(log, "log"), local(out, "out")
     check_outputs([OutputFile("out", folder, files=("*",), keeps=True)], [source, noise], overwrite=overwrite)
-    tell: NamedProgress = progress or (lambda done, total, word: None)
+    tell = progress or silent
     if format == "euroc":
         return euroc.write(source, folder, imu, noise, overwrite, tell)
     if format in simulators.FORMATS and imu is None:

@@ -11,7 +11,7 @@ from typing import overload
 import numpy as np
 
 from imutool import debiasing, evaluation
-from imutool.api import Init, Progress, checked, init_text
+from imutool.api import Init, checked, init_text
 from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import BiasModel
@@ -30,6 +30,7 @@ from imutool.log_info.convention_report import contradictions, warn_of_recording
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.recording import Imu, Recording, nanoseconds
+from imutool.report import Progress
 
 Model = str | Path | BiasModel
 

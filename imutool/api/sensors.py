@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from imutool import diagnosis_output
-from imutool.api import NamedProgress, checked, given_logs
+from imutool.api import checked, given_logs
 from imutool.diagnosis.diagnose import ComparedLogs
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.second_simulation import along_samples
@@ -18,6 +18,7 @@ from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.processes.blas_threads import one_blas_thread
 from imutool.recording import Recording
+from imutool.report import NamedProgress, silent
 from imutool.sensor.made_up_flight import FlightSettings, flight
 from imutool.sensor.simulate import Simulation
 from imutool.sensor.simulate import simulate as simulate_log
@@ -157,5 +158,5 @@ def diagnose(
             close=close,
             metric=metric,
             overwrite=overwrite,
-            tell=progress,
+            tell=progress or silent,
         )[0]

@@ -15,8 +15,8 @@ from imutool.errors import ConfigError, LogError
 from imutool.file_location import Location, same_location
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.storage.target import Target
+from imutool.report import Progress, silent
 
-Progress = Callable[[int, int], None]
 NO_ATTACHMENTS = "a bag has no attachments"  # to keep damaged bytes in
 PASSES = 3  # to plan, to write, to check
 
@@ -98,7 +98,7 @@ def repair_bag(source: Location, target: Location, *, overwrite: bool = False, p
     """
     if same_location(source, target):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
-    tell = progress or (lambda done, total: None)
+    tell = progress or silent
     with Bag(source, recover=True) as bag, Target(target, overwrite=overwrite) as out:
         size = bag.source.size
         index_pos, count = _plan(bag, lambda done: tell(done, PASSES * size))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -22,14 +21,6 @@ LOGS = Written(files=("*.mcap",), keeps=True)  # a file, or a folder of files
 FOLDER = Written(files=("*",), keeps=True)
 
 
-class Compression(StrEnum):
-    """Compression of a log's chunks."""
-
-    zstd = "zstd"
-    lz4 = "lz4"
-    none = "none"
-
-
 @app.command(
     cls=listing("imutool.converters", "--format"), epilog="Example: [bold]imutool convert MH_04_difficult.zip MH_04.mcap[/]"
 )
@@ -40,7 +31,7 @@ def convert(
     target: Annotated[str, typer.Argument(metavar="OUT", help="File for one sequence, folder (or NAME/) for several."), LOGS],
     format: Annotated[str, typer.Option(help="auto, or a name from the list below.")] = "auto",
     sequence: Annotated[list[str] | None, typer.Option(help="Convert only this sequence. Repeatable.")] = None,
-    compression: Annotated[Compression, typer.Option(help="Compression of the chunks.")] = Compression.zstd,
+    compression: Annotated[Literal["zstd", "lz4", "none"], typer.Option(help="Compression of the chunks.")] = "zstd",
     no_images: Annotated[bool, typer.Option("--no-images", help="Leave camera frames out.")] = False,
     sensor: Annotated[str, typer.Option(metavar="NAME", help="The IMU's name, such as bmi160.")] = "",
     kind: Annotated[
@@ -60,7 +51,7 @@ def convert(
     common: Common = COMMON,
 ) -> None:
     """Convert any recording with an IMU to MCAP; the format is recognised."""
-    from imutool.conversion.run import convert as run
+    from imutool.api.logs import convert as run
 
     with common.progress("Converting") as tell:
         report = run(
@@ -68,7 +59,7 @@ def convert(
             target,
             format=format,
             sequences=sequence or (),
-            compression=compression.value,
+            compression=compression,
             images=not no_images,
             overwrite=common.overwrite,
             sensor=sensor,

@@ -5,7 +5,7 @@ logs ─ align_all ─> Pair[] ─ whitened ─> WhitenedImu[] ─ select_effect
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -55,6 +55,7 @@ from imutool.log_info.convention_report import check_one_sensor, check_units, co
 from imutool.mcap_io.read import read
 from imutool.processes.forked import Forked
 from imutool.recording import Recording
+from imutool.report import NamedProgress, silent
 from imutool.sensor import catalogue
 from imutool.sensor.channels import with_channels
 from imutool.sensor.effect import Effect
@@ -63,10 +64,6 @@ from imutool.sensor.effects import clock_wander, gyro_bias_drift, gyro_bias_step
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 NEEDS_POSES = clock_wander.EFFECT.name  # one clock cannot wander against itself
 NEEDS_SIMULATION = "gyro_dead_band"  # a zero crossing takes milliseconds, beyond what poses know
-Tell = Callable[[int, int, str], None]
-
-
-def _silent(done: int, total: int, text: str) -> None: ...
 
 
 class ComparedLogs(NamedTuple):
@@ -87,7 +84,7 @@ def diagnose(
     imu: str | None = None,
     truth: str | None = None,
     signals: Sequence[str] = (),
-    tell: Tell | None = None,
+    tell: NamedProgress = silent,
     settings: DiagnoseSettings = DEFAULT,
     begin: Sequence[Finding] = (),
 ) -> Diagnosis:
@@ -101,12 +98,12 @@ def diagnose(
         ConfigError, LogError: a log cannot be read, or has no such topic; signals without a simulation, or of several logs.
         DataError: no truth and no simulation, too little shared time, another motion, no usable axis, different sensors.
     """
-    report, asked = tell or _silent, ComparedLogs(reals, sim, imu, truth, signals, settings)
-    report(0, 4, "reading")
+    asked = ComparedLogs(reals, sim, imu, truth, signals, settings)
+    tell(0, 4, "reading")
     check_signals(signals, reals, sim)
     topics = imu_topics(reals[0])
     if sim is not None and not (topics and imu_topics(sim)):
-        return with_signals(Diagnosis.without_imu(reals, sim), reals[0], sim, signals, report, settings)
+        return with_signals(Diagnosis.without_imu(reals, sim), reals[0], sim, signals, tell, settings)
     first = compared_imu(reals, imu)
     logs_read = [with_channels(read_log(real, imu=first, truth=truth), real) for real in reals]
     recordings = with_unique_names([log.recording for log in logs_read])
@@ -117,10 +114,10 @@ def diagnose(
         diagnosis = check_without_reference(recordings[0], str(reals[0]), "no simulation and no true poses", settings)
     else:
         remarks_read = [*(log.remark for log in logs_read if log.remark), *(wrong if sim is None else ())]
-        diagnosis, _ = _beside_reference(asked, recordings, remarks_read, report, begin)
+        diagnosis, _ = _beside_reference(asked, recordings, remarks_read, tell, begin)
     if others and first is not None:
         diagnosis = _with_other_imus(diagnosis, recordings[0], reals[0], first, others, settings)
-    report(4, 4, "")
+    tell(4, 4, "")
     return diagnosis
 
 
@@ -128,7 +125,7 @@ def _beside_reference(
     asked: ComparedLogs,
     recordings: Sequence[Recording],
     remarks_read: Sequence[str] = (),
-    report: Tell = _silent,
+    report: NamedProgress = silent,
     begin: Sequence[Finding] = (),
 ) -> tuple[Diagnosis, Selection | None]:
     """Diagnosis of recordings against a simulation or their own poses; `remarks_read` are those of reading them.

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from imutool.report import Report
-
-Progress = Callable[[int, int, str], None]  # done, in all, what is being written
 
 
 class ExportReport(Report, frozen=True, tag="imutool.export/1"):

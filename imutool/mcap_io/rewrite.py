@@ -36,6 +36,7 @@ from imutool.mcap_io.storage.target import PassThrough
 from imutool.mcap_io.verify import Verified, check_data_crc, check_mode, stated_crc, verify
 from imutool.mcap_io.write import CHUNK_BYTES
 from imutool.processes.system import give
+from imutool.report import Progress, silent
 
 REPAIR = "imutool repair sets them right"
 RUN_BYTES = 16 << 20  # of the source are copied at once; progress is reported between
@@ -64,7 +65,7 @@ def rewrite(
     overwrite: bool = False,
     check: str = "imu",
     own_encoding: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> RewriteReport:
     """Writes all of `source` to `target`, with derived topics and metadata records.
 
@@ -98,7 +99,7 @@ def rewrite(
         packing = next((block.compression for block in log.index.blocks if block.compression is not None), "none")
         crc, header, replace = bool(stated_crc(log.index)), log.index.header_bytes, overwrite or target is None
         with LogWriter(place, compression=packing, overwrite=replace, header=header, data_crc=crc) as out:
-            report = _Rewrite(log, out, derived, check, own_encoding, progress or (lambda *_: None)).run(metadata)
+            report = _Rewrite(log, out, derived, check, own_encoding, progress or silent).run(metadata)
             if target is None and isinstance(path, Path) and isinstance(out.target.temporary, Path):
                 _copy_permissions(path, out.target.temporary)
             if identity(path) != log.index.source.identity:
@@ -123,7 +124,7 @@ class _Rewrite:
         derived: Sequence[DerivedTopics],
         check: str,
         own: bool,
-        tell: Callable[[int, int], None],
+        tell: Progress,
     ) -> None:
         self.log, self.index, self.source, self.out = log, log.index, log.index.source, out
         self.check, self.tell = check, tell

@@ -7,7 +7,7 @@ its chunk, and the statistics are the sums of these. The contents of a chunk are
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, DataEnd, MetadataIndex, SummaryOffset
@@ -21,7 +21,7 @@ from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.chunk_check import check_chunk
 from imutool.mcap_io.storage.source import crc_of
-from imutool.report import Section
+from imutool.report import Progress, Section
 
 MODES = ("all", "imu", "none")
 
@@ -50,7 +50,7 @@ def verify(
     *,
     unpacked: Collection[int] | None = None,
     max_chunk: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> int:
     """Checks a log that should hold `counts` messages per channel id.
 
@@ -72,7 +72,7 @@ def verify_index(
     *,
     unpacked: Collection[int] | None = None,
     proven: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> int:
     """Checks an open log as `verify` does; returns how many chunks were unpacked.
 

@@ -29,6 +29,7 @@ from imutool.mcap_io.write import write
 from imutool.noise import datasheet as noises
 from imutool.recording import Imu, Poses, Recording, unit_quaternions
 from imutool.recording.columns import median
+from imutool.report import NamedProgress, silent
 from imutool.sensor import physics_file
 from imutool.sensor.channels import channels_at, needs_channels, with_channels
 from imutool.sensor.effect import Acting, simulate_stretches
@@ -45,8 +46,6 @@ MAX_M_S2 = 100.0  # median acceleration; ten times gravity for half of the time 
 MOTION_HZ = 400.0  # of the motion's clock, at least: filters and shifts act there before samples are taken
 MOTION_TOPIC = "/motion/pose"  # the exact motion of the samples; the truth that it was smoothed from is copied
 TRUTH_TOPIC = "/ground_truth/pose"
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +94,7 @@ def simulate(
     seed: int = 0,
     truth: str | None = None,
     overwrite: bool = False,
-    progress: Progress | None = None,
+    progress: NamedProgress | None = None,
     along: Along | None = None,
 ) -> Simulation:
     """Simulate an IMU along the poses of a log and write the log `out`; see `simulated`.
@@ -108,7 +107,7 @@ def simulate(
         LogError: the log has no poses, or is damaged.
         DataError: less than 2 s of trusted motion, an effect without its channel, or poses that the log's IMU contradicts.
     """
-    report = progress or (lambda done, total, word: None)
+    report = progress or silent
     file = PhysicsFile() if physics is None else physics_file.read(physics)
     acting, sheet = file.acting(where=physics or "physics"), noises.read(noise)
     sensor = SimulatedSensor(acting, file.start_ns, sheet, rate_hz, seed)

@@ -12,7 +12,7 @@ given six further steps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -24,6 +24,7 @@ from imutool.array_types import Float64, Int64
 from imutool.errors import NumericsError, required
 from imutool.inertial.strapdown import StartPose
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, seconds
+from imutool.report import Progress
 from imutool.vio.camera import EUROC, Frame
 
 Vectors = Float64[np.ndarray, "n 3"]
@@ -86,7 +87,7 @@ def estimate(
     *,
     pixel_std: float,
     bias_states: bool,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Estimate:
     """The trajectory at some samples of the IMU (`keyframes`, their rows).
 

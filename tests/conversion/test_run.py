@@ -20,7 +20,7 @@ from support.tables import write_csv
 
 import imutool as imutool_api
 from imutool import registry
-from imutool.conversion.run import convert
+from imutool.api.logs import convert
 from imutool.conversion.workers import ConvertReport
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.log import Log

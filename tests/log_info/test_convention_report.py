@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imutool.api.logs import export
+from imutool.api.logs import convert, export
 from imutool.api.models import debias as debias_recording
-from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.diagnosis.diagnose import diagnose
 from imutool.errors import DataError, ImutoolError, ModelError

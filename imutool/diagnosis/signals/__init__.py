@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import reduce
 from itertools import product
@@ -20,6 +20,7 @@ from imutool.diagnosis.signals.signal_diagnosis import SignalDiagnosis, diagnose
 from imutool.errors import ConfigError, DataError
 from imutool.file_location import Location
 from imutool.mcap_io.fields import others, read_field
+from imutool.report import NamedProgress
 
 BY_OTHERS = frozenset({"pressure", "magnetic", "gnss"})  # kinds whose own physics may be most of the signal
 
@@ -45,7 +46,7 @@ def with_signals(
     real: Location,
     sim: Location,
     named: Sequence[str],
-    report: Callable[[int, int, str], None],
+    report: NamedProgress,
     settings: DiagnoseSettings,
     clock: ClockDifference | None = None,
 ) -> Diagnosis:
