@@ -40,7 +40,7 @@ from imutool.mcap_io.repair import repaired
 from imutool.mcap_io.rewrite import RewriteReport, Values, rewrite
 from imutool.mcap_io.verify import Verified, check_mode
 from imutool.recording import seconds
-from imutool.report import Progress, json_values
+from imutool.report import Progress, json_values, silent
 
 SUFFIX, CLEAN_RECORD = "/debiased", "imutool_clean"
 DEBIASED_BY = "debiased_by"  # in the record `imutool`: the log's own IMU is a debiased one, from `imutool.debias` of arrays
@@ -157,7 +157,7 @@ def debias(
     force: bool = False,
     overwrite: bool = False,
     encoding: str = "own",
-    progress: Progress | None = None,
+    progress: Progress = silent,
     watch: BlockCallback | None = None,
 ) -> DebiasReport:
     """Writes `target`: all of `source`, and for each IMU its debiased samples and the bias.
@@ -232,7 +232,7 @@ def _debias(
     losses: Losses,
     target: Location | None,
     options: _Options,
-    progress: Progress | None,
+    progress: Progress,
 ) -> DebiasReport:
     """Debiases an open log: the source itself, or the repaired copy of a damaged one."""
     given = dict(options.model) if isinstance(options.model, Mapping) else {} if options.model is None else {"": options.model}

@@ -19,10 +19,17 @@ from imutool.bias.model_file import find_model
 from imutool.bias_start.aided_path import aided_path, residual_prior
 from imutool.bias_start.bias_covariance import ExpectedDrift
 from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std, corrected
-from imutool.bias_start.fitness import judge
-from imutool.bias_start.initial_bias import InitialBias, model_samples
-from imutool.bias_start.model_choice import bound_to, check_start, estimate_at_rest, find_initial_bias, smooth_in_memory
+from imutool.bias_start.initial_bias import InitialBias
+from imutool.bias_start.model_choice import (
+    bound_to,
+    check_start,
+    estimate_at_rest,
+    find_initial_bias,
+    fitness_in_memory,
+    smooth_in_memory,
+)
 from imutool.bias_start.stretches import measured_imu, read_stretches
+from imutool.debiasing import DEBIASED_BY, SUFFIX
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.exporting.tum import write_trajectory
 from imutool.inertial import metrics
@@ -109,15 +116,11 @@ def debiased_by(about: Mapping[str, str], topic: str) -> str:
 
     `about` is the record `imutool` of its log.
     """
-    from imutool.debiasing import DEBIASED_BY, SUFFIX
-
     return about.get(DEBIASED_BY) or (about.get("model", "") if topic == f"{about.get('source_topic')}{SUFFIX}" else "")
 
 
 def _debiased(log: Path, stretches: Sequence[Recording], truth: str | None) -> Sequence[Imu | None]:
     """The samples of the same stretches that the log has debiased."""
-    from imutool.debiasing import SUFFIX
-
     topic = f"{stretches[0].imu_topic}{SUFFIX}"
     with Log(log) as opened:
         known = topic in opened.topics
@@ -152,7 +155,7 @@ def _evaluated(
     for name, imu, model, start in [*recorded, *((name, recording.imu, model, start) for name, model, start in corrections)]:
         if span is None or imu is not recording.imu:
             span = TrueSpan(imu.t_ns, recording.truth, recording.name)
-        fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong) if model and start else None
+        fit = fitness_in_memory(model, start, recording, wrong) if model and start else None
         release_memory()
         whole_log, std = _corrected(imu, model, start, with_std=aids is not None)
         samples = whole_log.rows(span.span)

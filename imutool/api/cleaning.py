@@ -94,7 +94,7 @@ def clean(
         clean=wanted,
         force=force,
         overwrite=overwrite,
-        progress=progress,
+        progress=progress or silent,
     )
     return CleanReport(tuple(report.surveys.values()), report.losses, dict(report.rewrite.added))
 
@@ -152,9 +152,9 @@ def repair(
         (False, True)
     """
     check_outputs([OutputFile("target", target, (*output_conflicts.LOG, ".bag"))], [source], overwrite=overwrite)
-    origin, destination = location(source), location(target)
+    origin, destination, tell = location(source), location(target), progress or silent
     if not is_bag(origin):
-        return repair_log(origin, destination, damaged=damaged, max_chunk=max_chunk, overwrite=overwrite, progress=progress)
+        return repair_log(origin, destination, damaged=damaged, max_chunk=max_chunk, overwrite=overwrite, progress=tell)
     if damaged != "drop":
         raise ConfigError(NO_ATTACHMENTS, where="damaged=keep", fix="Leave `damaged` out")
-    return repair_bag(origin, destination, overwrite=overwrite, progress=progress)
+    return repair_bag(origin, destination, overwrite=overwrite, progress=tell)

@@ -167,7 +167,7 @@ def convert(
         format=format,
         sequences=several(sequences),
         workers=workers,
-        progress=progress,
+        progress=progress or silent,
     )
 
 

@@ -98,7 +98,7 @@ def simulate(
         seed=seed,
         truth=truth,
         overwrite=overwrite,
-        progress=progress,
+        progress=progress or silent,
         along=None if imu is None else partial(along_samples, imu=imu),
     )
 

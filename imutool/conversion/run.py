@@ -32,7 +32,7 @@ from imutool.mcap_io.storage.local import is_stream, removed_if_empty
 from imutool.processes.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
-from imutool.report import NamedProgress
+from imutool.report import NamedProgress, silent
 
 AUTO = "auto"
 
@@ -68,7 +68,7 @@ def convert(
     format: str = AUTO,
     sequences: Sequence[str] = (),
     workers: int | None = None,
-    progress: NamedProgress | None = None,
+    progress: NamedProgress = silent,
 ) -> ConvertReport:
     """Convert as `imutool.convert`: one sequence to the file `out`, or several to the folder `out`.
 
@@ -113,7 +113,7 @@ def _convert_found(
     sequences: Sequence[str],
     template: Job,
     workers: int | None,
-    progress: NamedProgress | None,
+    progress: NamedProgress,
 ) -> ConvertReport:
     """Write a log of each sequence, or of those asked for."""
     if sequences:
@@ -254,7 +254,7 @@ def _from_stream(
     out: str | Path,
     wanted: Sequence[str],
     template: Job,
-    progress: NamedProgress | None,
+    progress: NamedProgress,
 ) -> ConvertReport:
     """Convert one after the other, with a converter that only has `read`.
 
@@ -273,8 +273,7 @@ def _from_stream(
         check_targets([job := replace(template, sequence=recording, target=target)], source)
         kept = replace(recording, frames={}) if isinstance(recording, Recording) and not template.images else recording
         report.add(target, write_content(kept, job))
-        if progress is not None:
-            progress(len(report.written), len(report.written), recording.name)
+        progress(len(report.written), len(report.written), recording.name)
     missing = set(wanted) - {path.stem for path in report.written} if len(first) > 1 else set(wanted) - {first[0].name}
     report.failures.extend(Failure(name, f"{source}: holds no such sequence") for name in sorted(missing))
     return report

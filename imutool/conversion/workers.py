@@ -95,7 +95,7 @@ class ConvertReport(Report, frozen=True, tag="imutool.conversion/1"):
         return ConvertReport(self.written, failures, notes, losses)
 
 
-def run_jobs(jobs: Sequence[Job], of: int, workers: int, progress: NamedProgress | None) -> dict[int, Outcome]:
+def run_jobs(jobs: Sequence[Job], of: int, workers: int, progress: NamedProgress) -> dict[int, Outcome]:
     """Outcomes of jobs by their numbers.
 
     `of` counts also sequences that cannot be read, and are no jobs. A log that lacks what most of the others show of their
@@ -143,13 +143,12 @@ def _with_common_corrections(jobs: Sequence[Job], outcomes: Mapping[int, Outcome
     return {n: replace(jobs[n], common=common, overwrite=True) for n in lacking}
 
 
-def _run(jobs: Sequence[Job], of: int, workers: int, progress: NamedProgress | None) -> Iterator[tuple[int, Outcome]]:
+def _run(jobs: Sequence[Job], of: int, workers: int, progress: NamedProgress) -> Iterator[tuple[int, Outcome]]:
     """Yield each job's number and outcome, as the jobs end."""
     each = min(workers, len(jobs))
     done = ((n, _convert_one(job)) for n, job in enumerate(jobs)) if each <= 1 else _run_in_processes(jobs, each)
     for count, (number, outcome) in enumerate(done, start=1):
-        if progress is not None:
-            progress(of - len(jobs) + count, of, jobs[number].sequence.name)
+        progress(of - len(jobs) + count, of, jobs[number].sequence.name)
         yield number, outcome
 
 

@@ -66,7 +66,7 @@ def repair(
     damaged: str = "drop",
     overwrite: bool = False,
     max_chunk: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> RepairReport:
     """Writes the intact part of `source` to `target`, in order of log time, with all indexes.
 
@@ -83,13 +83,12 @@ def repair(
         raise ConfigError(f"unknown treatment of damaged bytes {damaged!r}", where="damaged", expected="drop or keep")
     if same_location(source, target):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
-    tell = progress or silent
     with collector_paused(), RecoveredLog(source, max_chunk=max_chunk, reads_topics=False) as log:
         try:
-            return _copy_intact(log, target, overwrite, tell) or _repair(log, target, damaged, overwrite, tell)
+            return _copy_intact(log, target, overwrite, progress) or _repair(log, target, damaged, overwrite, progress)
         except _ContradictionError:
             log.read_by_records()
-            return _repair(log, target, damaged, overwrite, tell)
+            return _repair(log, target, damaged, overwrite, progress)
 
 
 class _ContradictionError(Exception):

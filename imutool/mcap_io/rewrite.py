@@ -65,7 +65,7 @@ def rewrite(
     overwrite: bool = False,
     check: str = "imu",
     own_encoding: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> RewriteReport:
     """Writes all of `source` to `target`, with derived topics and metadata records.
 
@@ -99,7 +99,7 @@ def rewrite(
         packing = next((block.compression for block in log.index.blocks if block.compression is not None), "none")
         crc, header, replace = bool(stated_crc(log.index)), log.index.header_bytes, overwrite or target is None
         with LogWriter(place, compression=packing, overwrite=replace, header=header, data_crc=crc) as out:
-            report = _Rewrite(log, out, derived, check, own_encoding, progress or silent).run(metadata)
+            report = _Rewrite(log, out, derived, check, own_encoding, progress).run(metadata)
             if target is None and isinstance(path, Path) and isinstance(out.target.temporary, Path):
                 _copy_permissions(path, out.target.temporary)
             if identity(path) != log.index.source.identity:

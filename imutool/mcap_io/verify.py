@@ -21,7 +21,7 @@ from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.chunk_check import check_chunk
 from imutool.mcap_io.storage.source import crc_of
-from imutool.report import Progress, Section
+from imutool.report import Progress, Section, silent
 
 MODES = ("all", "imu", "none")
 
@@ -50,7 +50,7 @@ def verify(
     *,
     unpacked: Collection[int] | None = None,
     max_chunk: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> int:
     """Checks a log that should hold `counts` messages per channel id.
 
@@ -72,7 +72,7 @@ def verify_index(
     *,
     unpacked: Collection[int] | None = None,
     proven: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> int:
     """Checks an open log as `verify` does; returns how many chunks were unpacked.
 
@@ -86,8 +86,7 @@ def verify_index(
         whole = unpacked is None or block.offset in unpacked
         sums.add(index, block, whole=whole)
         done += whole
-        if progress:
-            progress(block.end, index.source.size)
+        progress(block.end, index.source.size)
     sums.compare(index, counts)
     _check_summary(index, complete=proven)
     if unpacked is None:

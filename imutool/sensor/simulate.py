@@ -94,7 +94,7 @@ def simulate(
     seed: int = 0,
     truth: str | None = None,
     overwrite: bool = False,
-    progress: NamedProgress | None = None,
+    progress: NamedProgress = silent,
     along: Along | None = None,
 ) -> Simulation:
     """Simulate an IMU along the poses of a log and write the log `out`; see `simulated`.
@@ -107,19 +107,18 @@ def simulate(
         LogError: the log has no poses, or is damaged.
         DataError: less than 2 s of trusted motion, an effect without its channel, or poses that the log's IMU contradicts.
     """
-    report = progress or silent
     file = PhysicsFile() if physics is None else physics_file.read(physics)
     acting, sheet = file.acting(where=physics or "physics"), noises.read(noise)
     sensor = SimulatedSensor(acting, file.start_ns, sheet, rate_hz, seed)
     if same_location(out, trajectory):
         raise ConfigError("is the trajectory itself", where=out, expected="another OUT")
     _check(rate_hz, seed)
-    report(0, 2, "simulating")
+    progress(0, 2, "simulating")
     try:
         simulation = (along or _along_poses)(trajectory, truth, sensor)
     except ImutoolError as error:
         raise error.at(trajectory) from error
-    report(1, 2, "writing")
+    progress(1, 2, "writing")
     settings = {
         "command": "simulate",
         "trajectory": trajectory.name,
@@ -130,7 +129,7 @@ def simulate(
     texts = {key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False) for key, value in settings.items()}
     recording = replace(simulation.recording, name=out.stem, metadata={**simulation.recording.metadata, "imutool": texts})
     write(recording, out, overwrite=overwrite)
-    report(2, 2, "")
+    progress(2, 2, "")
     others = (
         f"{entry.name} of {entry.column} is no effect of an IMU, and not simulated" for entry in file.effect if entry.column
     )
