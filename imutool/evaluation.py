@@ -112,10 +112,7 @@ def measured_once(recording: Recording, log: Path) -> Recording:
 
 
 def debiased_by(about: Mapping[str, str], topic: str) -> str:
-    """Name of the model that has debiased an IMU already; empty for a raw one.
-
-    `about` is the record `imutool` of its log.
-    """
+    """Name of the model that has debiased an IMU, by its log's record `imutool`, or empty."""
     return about.get(DEBIASED_BY) or (about.get("model", "") if topic == f"{about.get('source_topic')}{SUFFIX}" else "")
 
 
