@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -160,15 +161,9 @@ def convert(
         mapping=mapping if mapping is None or isinstance(mapping, Mapping) else local(mapping, "mapping"),
         correct=tuple(name for name, asked in ((CONVENTIONS, fix), (STAMPS, restamp)) if asked),
     )
-    return conversion.convert(
-        local(source, "source"),
-        f"{local(out, 'out')}/" if str(out).endswith("/") else local(out, "out"),
-        template,
-        format=format,
-        sequences=several(sequences),
-        workers=workers,
-        progress=progress or silent,
-    )
+    place, names = f"{local(out, 'out')}/" if str(out).endswith("/") else local(out, "out"), several(sequences)
+    convert_all = partial(conversion.convert, local(source, "source"), place, template, format=format, sequences=names)
+    return convert_all(workers=workers, progress=progress or silent)
 
 
 @checked

@@ -246,7 +246,7 @@ def matrices() -> Shapes:
 
 
 class Session(msgspec.Struct, frozen=True):
-    """Session of one switching-on, in a card: stamps of its logs, and the rest bias of its next log."""
+    """Session of one switching-on: stamps of its logs, and the rest bias of its next log."""
 
     start_ns: int
     end_ns: int

@@ -70,7 +70,7 @@ def convert(
     workers: int | None = None,
     progress: NamedProgress = silent,
 ) -> ConvertReport:
-    """Convert as `imutool.convert`: one sequence to the file `out`, or several to the folder `out`.
+    """Convert one sequence to the file `out`, or several to the folder, as `imutool.convert`.
 
     `template` is what the job of each sequence has in common; `out` with a slash at its end is a folder.
 

@@ -67,7 +67,7 @@ NEEDS_SIMULATION = "gyro_dead_band"  # a zero crossing takes milliseconds, beyon
 
 
 class ComparedLogs(NamedTuple):
-    """Recordings and a simulation (None for their own poses), what is compared in them, and settings."""
+    """Recordings and a simulation, or none, what is compared in them, and settings."""
 
     reals: Sequence[Location]
     sim: Location | None = None

@@ -32,12 +32,12 @@ Samples = Float64[np.ndarray, "_ k"]
 
 
 class Misfit(NamedTuple):
-    """Real minus expected samples, without noise unless means are formed; the axes of a signal of three are named."""
+    """Real minus expected samples; they have noise where means are formed (`averaged`)."""
 
     t_s: Float64[np.ndarray, " n"]
     samples: Float64[np.ndarray, "n k"]
     noise: Float64[np.ndarray, " k"]  # standard deviation of a sample, by column
-    signals: Mapping[str, slice] = IMU_SIGNALS  # columns by signal
+    signals: Mapping[str, slice] = IMU_SIGNALS  # columns by signal; the axes of a signal of three are named
     averaged: Sequence[int] = ()  # samples of running means, the longest first
 
 

@@ -8,7 +8,7 @@ from imutool.report import Report
 
 
 class ExportReport(Report, frozen=True, tag="imutool.export/1"):
-    """Exported files with their messages or rows, the IMU's topic (EuRoC), and the topics left out."""
+    """Exported files with their rows, the IMU's topic (EuRoC), and the topics left out."""
 
     output: Path
     format: str

@@ -153,12 +153,12 @@ def _channel(samples: SensorSamples, name: str) -> Float64[np.ndarray, " n"]:
 
 
 class SimulatedSensor(NamedTuple):
-    """Effects, the stamp from which they count time, noise, rate (None: that of the log), and the seed of the noise."""
+    """Sensor to simulate: effects, the stamp from which they count time, noise, rate and seed."""
 
     acting: Acting
     start_ns: int | None
     noise: datasheet.Noise
-    rate_hz: float | None
+    rate_hz: float | None  # by default that of the log
     seed: int
 
 

@@ -89,10 +89,11 @@ def _findings(d: Diagnosis) -> Iterator[str]:
     yield "<h2>Unmodelled effects</h2>"
     yield f'<div class="scroll"><table class="findings"><thead><tr>{head}</tr></thead><tbody>'
     for finding in d.findings:
+        python = f"<pre>{text(finding.python)}</pre>" if finding.python else ""
         cells = [
             f"<strong>{text(label(finding))}</strong> {text(finding.signal)}"
             f"<br>{text(effect_sentence(d, finding))}{_similar(finding)}",
-            f"<code>{text(finding.equation)}</code>{_python(finding)}{_entries(finding)}",
+            f"<code>{text(finding.equation)}</code>{python}{_entries(finding)}",
             _gain(finding),
             f"<span class=entry>{text(chance_text(finding.false_discovery_rate, short=True))}</span>",
         ]
@@ -124,10 +125,6 @@ def _entries(finding: Finding) -> str:
             listed = "; ".join(f"<span class=entry>{text(entry)}</span>" for entry in entries)
             out.append(f"<br>{text(quantity.label)} {listed} {text(unit)}".rstrip())
     return "".join(out)
-
-
-def _python(finding: Finding) -> str:
-    return f"<pre>{text(finding.python)}</pre>" if finding.python else ""
 
 
 def _locations(d: Diagnosis) -> Iterator[str]:

@@ -134,7 +134,7 @@ def png(picture: Picture, heading: str) -> bytes:
 
 
 def figure_of(drawn: str, prefix: str, caption: str = "") -> str:
-    """`<figure>` of an `<svg>` element, whose identifiers get a prefix: a page holds several drawings."""
+    """Figure of a drawing, whose identifiers get a prefix: a page holds several drawings."""
     own = re.sub(r'(?<= id=")|(?<=href="#)|(?<=url\(#)', f"{prefix}-", drawn)
     return f"<figure>{own}{f'<figcaption>{caption}</figcaption>' if caption else ''}</figure>"
 
