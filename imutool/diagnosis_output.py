@@ -20,9 +20,8 @@ import msgspec
 import numpy as np
 
 from imutool.diagnosis.closed_loop import CLOSED_LOG, ROUNDS, check_metric, closed_loop, figure, is_worth_a_round
-from imutool.diagnosis.diagnose import ComparedLogs
+from imutool.diagnosis.compared_logs import ComparedLogs
 from imutool.diagnosis.diagnose import diagnose as diagnose_logs
-from imutool.diagnosis.imu_relation import compared_imu
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.second_simulation import simulate_again
 from imutool.diagnosis.to_sensor_files import to_noise_file, to_physics_file
@@ -129,7 +128,7 @@ def diagnose(
     def look(findings: Path | None = None) -> list[RunData]:
         from imutool.viewing.model.load_view import load
 
-        return [load(real, imu=compared_imu(reals, imu), truth=truth, findings=findings) for real in reals]
+        return [load(real, imu=asked.compared_imu(), truth=truth, findings=findings) for real in reals]
 
     if metric is not None:
         check_metric(metric, closes=close and sim is not None)

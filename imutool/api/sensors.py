@@ -10,7 +10,7 @@ import msgspec
 
 from imutool import diagnosis_output
 from imutool.api import checked, given_logs
-from imutool.diagnosis.diagnose import ComparedLogs
+from imutool.diagnosis.compared_logs import ComparedLogs
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.second_simulation import along_samples
 from imutool.file_location import LogPath, local, several

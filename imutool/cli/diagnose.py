@@ -67,7 +67,7 @@ def diagnose(
     from imutool import diagnosis_output
     from imutool.config import load as load_settings
     from imutool.diagnosis.closed_loop import script_metric
-    from imutool.diagnosis.diagnose import ComparedLogs
+    from imutool.diagnosis.compared_logs import ComparedLogs
     from imutool.diagnosis.settings import DiagnoseSettings
     from imutool.file_location import local, refuse_twins, to_location
     from imutool.processes.forked import forking

@@ -17,6 +17,7 @@ from imutool.diagnosis import summarize
 from imutool.diagnosis.audit import simulator_remarks
 from imutool.diagnosis.audit.simulation import imu_in, read_simulation
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
+from imutool.diagnosis.compared_logs import ComparedLogs, imu_topics
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair
@@ -30,7 +31,7 @@ from imutool.diagnosis.estimation.trial.effect_forms import in_forms
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.held_out import resimulate
-from imutool.diagnosis.imu_relation import compared_imu, imu_relation, imu_sentence, imu_topics
+from imutool.diagnosis.imu_relation import imu_relation, imu_sentence
 from imutool.diagnosis.reference.another_motion import compared
 from imutool.diagnosis.reference.conventions import with_common_conventions
 from imutool.diagnosis.reference.coverage import (
@@ -66,17 +67,6 @@ NEEDS_POSES = clock_wander.EFFECT.name  # one clock cannot wander against itself
 NEEDS_SIMULATION = "gyro_dead_band"  # a zero crossing takes milliseconds, beyond what poses know
 
 
-class ComparedLogs(NamedTuple):
-    """Recordings and a simulation, or none, what is compared in them, and settings."""
-
-    reals: Sequence[Location]
-    sim: Location | None = None
-    imu: str | None = None
-    truth: str | None = None
-    signals: Sequence[str] = ()
-    settings: DiagnoseSettings = DEFAULT
-
-
 def diagnose(
     reals: Sequence[Location],
     sim: Location | None = None,
@@ -100,11 +90,11 @@ def diagnose(
     """
     asked = ComparedLogs(reals, sim, imu, truth, signals, settings)
     tell(0, 4, "reading")
-    check_signals(signals, reals, sim)
+    check_signals(asked)
     topics = imu_topics(reals[0])
     if sim is not None and not (topics and imu_topics(sim)):
-        return with_signals(Diagnosis.without_imu(reals, sim), reals[0], sim, signals, tell, settings)
-    first = compared_imu(reals, imu)
+        return with_signals(Diagnosis.without_imu(reals, sim), asked, tell)
+    first = asked.compared_imu()
     logs_read = [with_channels(read_log(real, imu=first, truth=truth), real) for real in reals]
     recordings = with_unique_names([log.recording for log in logs_read])
     check_one_sensor(recordings)
@@ -176,7 +166,7 @@ def _beside_reference(
     findings, located = (*conventions, *wrong, *diagnosis.findings), places if wrong else diagnosis.located or places
     diagnosis = replace(diagnosis, findings=findings, located=located, remarks=remarks, caveat=caveat)
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
-        diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings, clock_difference(pairs, selection.whole))
+        diagnosis = with_signals(diagnosis, asked, report, clock_difference(pairs, selection.whole))
     return diagnosis, selection
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from support import planted
 
 from imutool import diagnosis_output
-from imutool.diagnosis.diagnose import ComparedLogs
+from imutool.diagnosis.compared_logs import ComparedLogs
 from imutool.diagnosis.settings import DiagnoseSettings, SearchSettings
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
