@@ -20,7 +20,7 @@ from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.log_binding import rows_without_drift, with_drift
 from imutool.bias.model import BiasModel
-from imutool.bias_start import Fitness, model_choice
+from imutool.bias_start import DEBIASED_BY, SUFFIX, Fitness, model_choice
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.stretches import Sieve
@@ -28,6 +28,7 @@ from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
 from imutool.errors import ConfigError, LogError, ModelError
 from imutool.file_location import Location, identity
+from imutool.mcap_io import Verified
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
@@ -38,12 +39,11 @@ from imutool.mcap_io.recovery.losses import Losses
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import repaired
 from imutool.mcap_io.rewrite import RewriteReport, Values, rewrite
-from imutool.mcap_io.verify import Verified, check_mode
+from imutool.mcap_io.verify import check_mode
 from imutool.recording import seconds
 from imutool.report import Progress, json_values, silent
 
-SUFFIX, CLEAN_RECORD = "/debiased", "imutool_clean"
-DEBIASED_BY = "debiased_by"  # in the record `imutool`: the log's own IMU is a debiased one, from `imutool.debias` of arrays
+CLEAN_RECORD = "imutool_clean"
 logger = logging.getLogger(__name__)
 
 

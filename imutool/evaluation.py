@@ -16,6 +16,7 @@ from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import GAP_S, BiasModel
 from imutool.bias.model_file import find_model
+from imutool.bias_start import DEBIASED_BY, SUFFIX
 from imutool.bias_start.aided_path import aided_path, residual_prior
 from imutool.bias_start.bias_covariance import ExpectedDrift
 from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std, corrected
@@ -29,7 +30,6 @@ from imutool.bias_start.model_choice import (
     smooth_in_memory,
 )
 from imutool.bias_start.stretches import measured_imu, read_stretches
-from imutool.debiasing import DEBIASED_BY, SUFFIX
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.exporting.tum import write_trajectory
 from imutool.inertial import metrics

@@ -13,9 +13,8 @@ from imutool.conversion.corrections import CONVENTIONS, STAMPS
 from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import ConvertReport, Job
 from imutool.errors import ConfigError, DataError, LogError, did_you_mean
-from imutool.exporting import ExportReport, euroc, rosbag2, simulators
+from imutool.exporting import ExportReport
 from imutool.file_location import LogPath, local, location, several
-from imutool.log_info import inspection
 from imutool.log_info.report import LogInfo
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import longest_recording, read_recordings
@@ -25,8 +24,6 @@ from imutool.mcap_io.temperature import with_temperatures
 from imutool.mcap_io.write import write as write_log
 from imutool.recording import Recording
 from imutool.report import NamedProgress, silent
-
-FORMATS = ("euroc", "rosbag2", *simulators.FORMATS)
 
 
 @checked
@@ -188,6 +185,8 @@ def info(path: LogPath, *, check: bool = True, max_chunk: int | None = None) -> 
         >>> report.imu[0].topic, round(report.imu[0].rate_hz)
         ('/imu0', 200)
     """
+    from imutool.log_info import inspection
+
     return inspection.inspect(location(path), check=check, max_chunk=max_chunk)
 
 
@@ -224,9 +223,12 @@ def export(
         >>> report.imu
         '/imu0'
     """
-    if format not in FORMATS:
-        fix = did_you_mean(format, FORMATS)
-        raise ConfigError(f"unknown format {format!r}", where="format", expected=" or ".join(FORMATS), fix=fix)
+    from imutool.exporting import euroc, rosbag2, simulators
+
+    formats = ("euroc", "rosbag2", *simulators.FORMATS)
+    if format not in formats:
+        fix = did_you_mean(format, formats)
+        raise ConfigError(f"unknown format {format!r}", where="format", expected=" or ".join(formats), fix=fix)
     source, folder = local(log, "log"), local(out, "out")
     check_outputs([OutputFile("out", folder, files=("*",), keeps=True)], [source, noise], overwrite=overwrite)
     tell = progress or silent

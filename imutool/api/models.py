@@ -16,14 +16,14 @@ from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import find_model, shipped_for
-from imutool.bias_start import Fitness
+from imutool.bias_start import DEBIASED_BY, Fitness
 from imutool.bias_start.correction import apply_with_std
 from imutool.bias_start.earlier_load import switched_on_before
 from imutool.bias_start.fitness import CHECKED_S
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.model_choice import find_initial_bias, fitness_in_memory
 from imutool.bias_start.stretches import measured_imu, unusual_gravity
-from imutool.debiasing import DEBIASED_BY, DebiasReport
+from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError, DataError
 from imutool.file_location import Location, LogPath, location, several
 from imutool.log_info.convention_report import contradictions, warn_of_recordings

@@ -15,7 +15,7 @@ from imutool.cli.app import COMMON, HTML, LOG, RRD, Common, Imus, Init, MaxChunk
 from imutool.cli.terminal import say, tell_losses
 from imutool.errors import LOST, ConfigError
 from imutool.file_location import Location, to_location
-from imutool.mcap_io.verify import Verified
+from imutool.mcap_io import Verified
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
 from imutool.viewing import Output
 

@@ -24,6 +24,7 @@ from mcap.records import Metadata, MetadataIndex
 
 from imutool.errors import ConfigError, LogError
 from imutool.file_location import Location, identity, same_location
+from imutool.mcap_io import Verified
 from imutool.mcap_io.blocks import Attachment, MessageBlock, MessageIndexes, RecordSpan, read_message_indexes
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.messages import Messages
@@ -33,7 +34,7 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.added_topics import DerivedStream, DerivedTopics, check_new_topics, define
 from imutool.mcap_io.passthrough.chunk_check import check_chunk, parts_of
 from imutool.mcap_io.storage.target import PassThrough
-from imutool.mcap_io.verify import Verified, check_data_crc, check_mode, stated_crc, verify
+from imutool.mcap_io.verify import check_data_crc, check_mode, stated_crc, verify
 from imutool.mcap_io.write import CHUNK_BYTES
 from imutool.processes.system import give
 from imutool.report import Progress, silent

@@ -21,17 +21,9 @@ from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.chunk_check import check_chunk
 from imutool.mcap_io.storage.source import crc_of
-from imutool.report import Progress, Section, silent
+from imutool.report import Progress, silent
 
 MODES = ("all", "imu", "none")
-
-
-class Verified(Section, frozen=True):
-    """Checks made on a log: the mode, and how many of its chunks were unpacked."""
-
-    mode: str
-    chunks_checked: int
-    chunks: int
 
 
 def check_mode(mode: str) -> None:
