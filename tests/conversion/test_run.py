@@ -64,7 +64,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def test_one_sequence_goes_to_the_file_named(source, tmp_path):
     report = convert(source / "a", tmp_path / "new" / "log.mcap")
-    assert report == ConvertReport([tmp_path / "new" / "log.mcap"], [])
+    assert report == ConvertReport([tmp_path / "new" / "log.mcap"], [], [], [])
     assert read(report.written[0]) == next(iter(registry.load("imutool.converters", "euroc").read(source / "a")))
 
 
