@@ -100,7 +100,7 @@ def effects(scale: Scale) -> Iterator[Effect]:
             ripple,
             linear=False,
             starts=ripple.starts,
-            alternatives=lambda _: round(MAX_TEETH),
+            alternatives=_trials,
             variant=scale.names[k] if len(scale.names) > 1 else "",
         )
         if scale.dynamics is None:
@@ -129,6 +129,10 @@ def effects(scale: Scale) -> Iterator[Effect]:
 
 def _on(scale: Scale, k: int) -> tuple[Any]:
     return (() if len(scale.names) == 1 else (scale.names[k],),)
+
+
+def _trials(_: Any) -> int:
+    return round(MAX_TEETH)
 
 
 # ── in the position ──
