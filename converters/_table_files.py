@@ -152,10 +152,6 @@ def _members(path: Path) -> set[str]:
         return set()
 
 
-def _load_csv(path: Path, columns: Columns) -> None:
-    read_text(text_of(read_bytes(path)), columns, path)
-
-
 def read_text(text: str, columns: Columns, path: Path) -> None:
     """Add the columns of a table of text, whatever program wrote it."""
     if read_mocap(text, columns, path):
@@ -256,7 +252,7 @@ OF_GROUPS: dict[str, Callable[[Path], list[str]]] = {  # names of the arrays, wi
     "hdf5": names_of_hdf5,
 }
 LOADERS: dict[str, Callable[[Path, Columns], None]] = {
-    "csv": _load_csv,
+    "csv": lambda path, columns: read_text(text_of(read_bytes(path)), columns, path),
     "json": load_json,
     "parquet": _load_parquet,
     "feather": _load_feather,

@@ -186,5 +186,5 @@ def _refuse_infinite(value: Any, where: str | Path | None, place: str = "") -> N
         for key, inner in value.items():
             _refuse_infinite(inner, where, f"{place}.{key}" if place else key)
     elif isinstance(value, list | tuple):
-        for inner in value:
-            _refuse_infinite(inner, where, place)
+        for k, inner in enumerate(value):
+            _refuse_infinite(inner, where, f"{place}[{k}]")

@@ -20,7 +20,7 @@ from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.log_binding import rows_without_drift, with_drift
 from imutool.bias.model import BiasModel
-from imutool.bias_start import Fitness, model_choice
+from imutool.bias_start import DEBIASED_BY, SUFFIX, Fitness, model_choice
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.stretches import Sieve
@@ -28,6 +28,7 @@ from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
 from imutool.errors import ConfigError, LogError, ModelError
 from imutool.file_location import Location, identity
+from imutool.mcap_io import Verified
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
@@ -38,11 +39,11 @@ from imutool.mcap_io.recovery.losses import Losses
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import repaired
 from imutool.mcap_io.rewrite import RewriteReport, Values, rewrite
-from imutool.mcap_io.verify import Verified, check_mode
+from imutool.mcap_io.verify import check_mode
 from imutool.recording import seconds
+from imutool.report import Progress, json_values, silent
 
-SUFFIX, CLEAN_RECORD = "/debiased", "imutool_clean"
-DEBIASED_BY = "debiased_by"  # in the record `imutool`: the log's own IMU is a debiased one, from `imutool.debias` of arrays
+CLEAN_RECORD = "imutool_clean"
 logger = logging.getLogger(__name__)
 
 
@@ -156,7 +157,7 @@ def debias(
     force: bool = False,
     overwrite: bool = False,
     encoding: str = "own",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
     watch: BlockCallback | None = None,
 ) -> DebiasReport:
     """Writes `target`: all of `source`, and for each IMU its debiased samples and the bias.
@@ -231,7 +232,7 @@ def _debias(
     losses: Losses,
     target: Location | None,
     options: _Options,
-    progress: Callable[[int, int], None] | None,
+    progress: Progress,
 ) -> DebiasReport:
     """Debiases an open log: the source itself, or the repaired copy of a damaged one."""
     given = dict(options.model) if isinstance(options.model, Mapping) else {} if options.model is None else {"": options.model}
@@ -260,7 +261,7 @@ def _debias(
 
         def metadata(verified: Verified) -> Values:
             origin = {"source_file": source.name, "source_size": str(source.stat().st_size), **digest.result()}
-            origin["verified"] = json.dumps(verified._asdict())
+            origin["verified"] = json.dumps(json_values(verified))
             entries = {_record_name("imutool", t, records): v | origin | sieves[t].record() for t, v in records.items()}
             return entries | {_record_name(CLEAN_RECORD, topic, records): found.record() for topic, found in surveys.items()}
 

@@ -20,12 +20,10 @@ import msgspec
 import numpy as np
 
 from imutool.diagnosis.closed_loop import CLOSED_LOG, ROUNDS, check_metric, closed_loop, figure, is_worth_a_round
+from imutool.diagnosis.compared_logs import ComparedLogs
 from imutool.diagnosis.diagnose import diagnose as diagnose_logs
-from imutool.diagnosis.estimation.aligned_log import DEFAULT
-from imutool.diagnosis.imu_relation import compared_imu
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.second_simulation import simulate_again
-from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_noise_file, to_physics_file
 from imutool.errors import ConfigError, ImutoolError, required
 from imutool.file_location import Location, local
@@ -35,7 +33,7 @@ from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.mcap_io.storage.target import Target, writing
 from imutool.noise import datasheet
 from imutool.processes.forked import Forked
-from imutool.report import json_text
+from imutool.report import NamedProgress, json_text, silent
 from imutool.sensor import physics_file
 from imutool.sensor.simulate import simulate
 
@@ -105,18 +103,13 @@ def write(
 
 
 def diagnose(
-    reals: Sequence[Location],
-    sim: Location | None = None,
+    asked: ComparedLogs,
     folder: Path | None = None,
     *,
-    imu: str | None = None,
-    truth: str | None = None,
-    signals: Sequence[str] = (),
-    settings: DiagnoseSettings = DEFAULT,
     close: bool = False,
     metric: Callable[[Path], float] | None = None,
     overwrite: bool = False,
-    tell: Callable[[int, int, str], None] | None = None,
+    tell: NamedProgress = silent,
     names: Mapping[str, str] | None = None,
 ) -> tuple[Diagnosis, list[str]]:
     """Diagnosis of recordings, written to a folder if given; a remark for each file left out.
@@ -130,29 +123,28 @@ def diagnose(
         LogError: no such topic.
         DataError: no truth and no simulation, or too little shared time.
     """
+    reals, sim, imu, truth, _, settings = asked
 
     def look(findings: Path | None = None) -> list[RunData]:
         from imutool.viewing.model.load_view import load
 
-        return [load(real, imu=compared_imu(reals, imu), truth=truth, findings=findings) for real in reals]
+        return [load(real, imu=asked.compared_imu(), truth=truth, findings=findings) for real in reals]
 
     if metric is not None:
         check_metric(metric, closes=close and sim is not None)
     if close:
         _check_close(reals, sim, folder, overwrite=overwrite)
-    against = partial(_diagnosed, names or {}, reals, imu=imu, truth=truth, settings=settings, tell=tell)
-    search = partial(against, sim, signals=signals)
+    search = partial(_diagnosed, names or {}, tell=tell)
     if folder is None:
-        return search(), []
+        return search(asked), []
     refuse(folder, overwrite=overwrite)
     given = local(sim, "close") if close and sim is not None else None
     was = None if metric is None or given is None else figure(metric, given)
     if find_spec(DRAWN[0]) is not None:
         required("matplotlib.figure", DRAWN[1])  # once, here: each process that draws is a copy of this one
     drawn = Forked(partial(_drawings, look), idle=True)  # of the logs, while they are diagnosed, where time is left
-    diagnosis = search()
-    if tell is not None:
-        tell(0, 1, "writing")
+    diagnosis = search(asked)
+    tell(0, 1, "writing")
     remarks = write(diagnosis, folder, logs=look, drawn=drawn, overwrite=overwrite)
     if close:
         rewrite = partial(write, folder=folder, logs=look, overwrite=True)
@@ -160,12 +152,12 @@ def diagnose(
         if given is not None:
             simulated = partial(simulate_again, reals[0], given, imu=imu, settings=settings)
         own = None if metric is None or was is None else (metric, was)
-        diagnosis = _closed(diagnosis, against, search, rewrite, simulated, folder, metric=own, overwrite=overwrite)
+        diagnosis = _closed(diagnosis, asked, search, rewrite, simulated, folder, metric=own, overwrite=overwrite)
     return diagnosis, remarks
 
 
-def _diagnosed(names: Mapping[str, str], *args: Any, **options: Any) -> Diagnosis:
-    d = diagnose_logs(*args, **options)
+def _diagnosed(names: Mapping[str, str], asked: ComparedLogs, **options: Any) -> Diagnosis:
+    d = diagnose_logs(**asked._asdict(), **options)
     real, sim = tuple(names.get(place, place) for place in d.real), names.get(d.sim or "", d.sim)
     located = tuple(msgspec.structs.replace(at, log=names.get(at.log, at.log)) for at in d.located)
     traces = tuple(replace(trace, path=names.get(trace.path, trace.path)) for trace in d.traces)
@@ -185,7 +177,7 @@ def _check_close(reals: Sequence[Location], sim: Location | None, folder: Path |
 
 def _closed(
     first: Diagnosis,
-    against: Callable[[Path], Diagnosis],
+    asked: ComparedLogs,
     search: Callable[..., Diagnosis],
     rewrite: Callable[[Diagnosis], object],
     simulated: Callable[..., object],
@@ -198,10 +190,10 @@ def _closed(
     log = folder / CLOSED_LOG
     for number in range(1, ROUNDS + 1):
         simulated(log, physics=folder / EFFECT, overwrite=overwrite or number > 1)
-        second = against(log)
+        second = search(asked._replace(sim=log, signals=()))
         if number == ROUNDS or not is_worth_a_round(first, second):
             break
-        better = search(begin=(*first.findings, *second.findings))
+        better = search(asked, begin=(*first.findings, *second.findings))
         if {finding.effect for finding in better.findings} == {finding.effect for finding in first.findings}:
             break
         rewrite(first := better)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,12 +16,19 @@ from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import GAP_S, BiasModel
 from imutool.bias.model_file import find_model
+from imutool.bias_start import DEBIASED_BY, SUFFIX
 from imutool.bias_start.aided_path import aided_path, residual_prior
 from imutool.bias_start.bias_covariance import ExpectedDrift
 from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std, corrected
-from imutool.bias_start.fitness import judge
-from imutool.bias_start.initial_bias import InitialBias, model_samples
-from imutool.bias_start.model_choice import bound_to, check_start, estimate_at_rest, find_initial_bias, smooth_in_memory
+from imutool.bias_start.initial_bias import InitialBias
+from imutool.bias_start.model_choice import (
+    bound_to,
+    check_start,
+    estimate_at_rest,
+    find_initial_bias,
+    fitness_in_memory,
+    smooth_in_memory,
+)
 from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.exporting.tum import write_trajectory
@@ -35,7 +42,7 @@ from imutool.log_info.aid_search import find_aids
 from imutool.log_info.convention_report import contradictions, warn_of_recordings
 from imutool.mcap_io.log import Log
 from imutool.processes.system import release_memory
-from imutool.recording import Imu, Recording, nanoseconds
+from imutool.recording import Imu, Poses, Recording, nanoseconds
 
 logger = logging.getLogger(__name__)
 
@@ -47,6 +54,7 @@ DRIFTS = "drift_orientation_deg", "drift_velocity_m_s", "drift_orientation_std_d
 DELAY = "pose_delay_s", "pose_delay_std_s", "aoe_without_delay_deg", "drift_orientation_without_delay_deg"
 PURE, AIDED = "integration", "aided"
 Refused = Callable[[str, ImutoolError], None]
+Correction = tuple[str, BiasModel, InitialBias]  # a model's name, the model, its start in a recording
 
 
 def evaluate(
@@ -88,7 +96,11 @@ def evaluate(
             with Log(log) as opened:
                 aids = find_aids(opened, recording, asked)
         chosen = recording.with_truth(next(iter(recording.truths))) if truth is None and recording.truths else recording
-        results += _evaluated(chosen, debiased, log, models, init, smooth, aids, trajectories, overwrite, refused)
+        scored, wrong = _scored(chosen)
+        corrections = started(scored, models, init, log, smooth=smooth, refused=refused, force=True)
+        how = {"init": init, "smooth": smooth}
+        save = None if trajectories is None else partial(write_trajectory, trajectories, scored.name, overwrite)
+        results += _evaluated(scored, debiased, corrections, wrong, how, aids, save)
     return results
 
 
@@ -100,19 +112,12 @@ def measured_once(recording: Recording, log: Path) -> Recording:
 
 
 def debiased_by(about: Mapping[str, str], topic: str) -> str:
-    """Name of the model that has debiased an IMU already; empty for a raw one.
-
-    `about` is the record `imutool` of its log.
-    """
-    from imutool.debiasing import DEBIASED_BY, SUFFIX
-
+    """Name of the model that has debiased an IMU, by its log's record `imutool`, or empty."""
     return about.get(DEBIASED_BY) or (about.get("model", "") if topic == f"{about.get('source_topic')}{SUFFIX}" else "")
 
 
 def _debiased(log: Path, stretches: Sequence[Recording], truth: str | None) -> Sequence[Imu | None]:
     """The samples of the same stretches that the log has debiased."""
-    from imutool.debiasing import SUFFIX
-
     topic = f"{stretches[0].imu_topic}{SUFFIX}"
     with Log(log) as opened:
         known = topic in opened.topics
@@ -120,35 +125,34 @@ def _debiased(log: Path, stretches: Sequence[Recording], truth: str | None) -> S
     return found if len(found) == len(stretches) else [None] * len(stretches)
 
 
-def _evaluated(
-    recording: Recording,
-    debiased: Imu | None,
-    log: Path,
-    models: Sequence[str | Path | BiasModel],
-    init: str,
-    smooth: bool,
-    aids: Aids | None,
-    trajectories: Path | None,
-    overwrite: bool,
-    refused: Refused | None,
-) -> list[dict[str, Any]]:
-    """Results of one stretch of a log."""
+def _scored(recording: Recording) -> tuple[Recording, Sequence[str]]:
+    """Recording with the true poses that can be scored, and their velocity; what contradicts its units, axes and frames."""
     (whole,) = warn_of_recordings([recording])
-    wrong = contradictions(whole)
     truth = recording.truth
     if (whole.world != np.eye(3)).any() or whole.position_unit != "m" or whole.quaternions:
         logger.warning("%s: until then its positions and velocities are not scored", recording.name)
         truth = replace(truth, p_wb=np.zeros_like(truth.p_wb), v_w=None)
-    recording = replace(recording, truths={next(iter(recording.truths)): with_velocity(truth)})
+    return replace(recording, truths={next(iter(recording.truths)): with_velocity(truth)}), contradictions(whole)
+
+
+def _evaluated(
+    recording: Recording,
+    debiased: Imu | None,
+    corrections: Iterable[Correction],
+    wrong: Sequence[str],
+    how: Mapping[str, object],
+    aids: Aids | None,
+    save: Callable[[str, Iterable[Poses]], None] | None,
+) -> list[dict[str, Any]]:
+    """Results of one stretch of a log; `wrong` are its contradictions, `how` the start that was asked for."""
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     recorded = [(RAW, recording.imu, None, None)]
     recorded += [] if debiased is None else [(str(about.get("model") or "debiased"), debiased, None, None)]
-    found = started(recording, models, init, log, smooth=smooth, refused=refused, force=True)
     span: TrueSpan | None = None
-    for name, imu, model, start in [*recorded, *((name, recording.imu, model, start) for name, model, start in found)]:
+    for name, imu, model, start in [*recorded, *((name, recording.imu, model, start) for name, model, start in corrections)]:
         if span is None or imu is not recording.imu:
             span = TrueSpan(imu.t_ns, recording.truth, recording.name)
-        fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong) if model and start else None
+        fit = fitness_in_memory(model, start, recording, wrong) if model and start else None
         release_memory()
         whole_log, std = _corrected(imu, model, start, with_std=aids is not None)
         samples = whole_log.rows(span.span)
@@ -158,21 +162,16 @@ def _evaluated(
         if aids is not None:
             begin = StartPose.of(span.rows(slice(0, 1)))
             estimates[AIDED] = partial(in_memory, aided_path(samples, begin, residual_prior(start, std), aids), span)
-        how = {"init": init if start else None, "init_how": start.how if start else None, "smooth": smooth}
+        begun = {"init": how["init"] if start else None, "init_how": start.how if start else None, "smooth": how["smooth"]}
         scores = list[dict[str, Any]]()
         for kind, estimate in estimates.items():
-            of = {
-                "log": recording.name,
-                "model": name,
-                "estimate": kind,
-                "aids": aids.signals if aids and kind == AIDED else {},
-            }
-            scores.append(of | how | {"fit": fit and to_builtins(fit)} | metrics.evaluate_blocks(estimate))
-            if trajectories is not None:
+            used = aids.signals if aids and kind == AIDED else {}
+            of = {"log": recording.name, "model": name, "estimate": kind, "aids": used}
+            scores.append(of | begun | {"fit": fit and to_builtins(fit)} | metrics.evaluate_blocks(estimate))
+            if save is not None:
                 label = name if kind == PURE else f"{name}_{kind}"
                 for side, named in enumerate((label, TRUTH) if (name, kind) == (RAW, PURE) else (label,)):
-                    parts = (block.scored()[side] for block in estimate())
-                    write_trajectory(parts, trajectories, recording.name, named, overwrite)
+                    save(named, (block.scored()[side] for block in estimate()))
         del estimates, estimate
         drifted = _drift(samples, span, model, start, recording.imu, has_positions=scores[0]["ape_m"] is not None)
         drifted |= _without_delay(whole_log, span, recording, drifted[DRIFTS[0]]) if model else Figures.fromkeys(DELAY)
@@ -257,7 +256,7 @@ def started(
     smooth: bool = False,
     refused: Refused | None = None,
     force: bool = False,
-) -> Iterator[tuple[str, BiasModel, InitialBias]]:
+) -> Iterator[Correction]:
     """Model name, model and initial bias in this recording, for each requested model.
 
     With `force` models of other rates count, too. `refused` is called with each that does not apply, and with the error.

@@ -16,7 +16,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
@@ -24,19 +24,20 @@ from msgspec import UNSET, UnsetType
 
 from imutool.errors import ConfigError, did_you_mean
 
-__all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", "json_text", "json_values", "report_type"]
+__all__ = ["REPORTS", "UNSET", "NamedProgress", "Progress", "Report", "Section", "UnsetType"]
+__all__ += ["json_schema", "json_text", "json_values", "report_type", "silent"]
 
 # by name, the module and the type: imported when its schema is asked for, so that --help stays light
 REPORTS = {
-    "catalog": "imutool.cli.fleet_view:CatalogReport",
+    "catalog": "imutool.fleet.rerun_catalog:CatalogReport",
     "audit": "imutool.diagnosis.audit:AuditReport",
     "clean": "imutool.cleaning.survey:CleaningReport",
-    "conversion": "imutool.cli.convert:Conversion",
+    "conversion": "imutool.conversion.workers:ConvertReport",
     "debias": "imutool.cli.debias:DebiasSummary",
     "demo": "imutool.cli.demo:DemoReport",
     "diagnosis": "imutool.diagnosis.result:DiagnosisReport",
     "evaluation": "imutool.cli.evaluate:Evaluation",
-    "export": "imutool.cli.convert:Export",
+    "export": "imutool.exporting:ExportReport",
     "fleet": "imutool.fleet.results:FleetSummary",
     "fleet-diagnosis": "imutool.fleet.robots:FleetDiagnosis",
     "info": "imutool.log_info.report:LogInfo",
@@ -51,6 +52,14 @@ REPORTS = {
     "view": "imutool.cli.view:View",
     "vio": "imutool.cli.evaluate:VioReport",
 }
+
+
+Progress = Callable[[int, int], None]  # bytes done, bytes in all
+NamedProgress = Callable[[int, int, str], None]  # steps done, steps in all, the current step
+
+
+def silent(*_: object) -> None:
+    """Progress that nobody looks at."""
 
 
 class Section(msgspec.Struct, frozen=True):
@@ -119,7 +128,8 @@ def json_schema(name: str) -> dict[str, Any]:
     Raises:
         ConfigError: no report has this name; the message names the nearest.
     """
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **msgspec.json.schema(report_type(name))}
+    schema = msgspec.json.schema(report_type(name), schema_hook=lambda kind: {"type": "string"})  # of a path: `_plain`
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
 def _plain(value: Any) -> Any:

@@ -21,6 +21,7 @@ from rosbags.highlevel import AnyReader
 from support.imu_defects import batch_of, cut
 from support.two_imus import write_two_imus
 
+from imutool.api.logs import convert
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import load, save
 from imutool.bias.networks import linear, neural_ode, static
@@ -33,7 +34,6 @@ from imutool.bias_start.initial_bias import InitialBias, bias_prior, from_number
 from imutool.bias_start.model_choice import estimate_at_rest
 from imutool.cleaning import CleaningSettings
 from imutool.cli.debias import assigned
-from imutool.conversion.run import convert
 from imutool.debiasing import Debiaser, debias
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.mcap_io.codec import schemas

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 import imutool
 from imutool import evaluation
+from imutool.api.logs import convert
 from imutool.bias import linear
 from imutool.bias.model_file import find_model, save
 from imutool.bias_start.correction import apply_with_std
@@ -26,7 +27,6 @@ from imutool.bias_start.initial_bias import MIN_STD
 from imutool.bias_start.model_choice import find_initial_bias
 from imutool.bias_start.prior_width import BiasPrior
 from imutool.cli import load
-from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.evaluation import evaluate, runs

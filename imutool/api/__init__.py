@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from imutool.recording import Recording
 
 LONGEST_NAME = 200  # bytes of the name of a file for a recording
-Progress = Callable[[int, int], None]  # bytes done, bytes in all
-NamedProgress = Callable[[int, int, str], None]  # steps done, steps in all, the current step
 Init = str | Iterable[float]  # initial bias: the name of a method, or six numbers
 Function = TypeVar("Function", bound=Callable[..., Any])
 

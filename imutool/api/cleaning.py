@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from imutool.api import Init, NamedProgress, Progress, checked, init_text
+from imutool.api import Init, checked, init_text
 from imutool.bag.repair import NO_ATTACHMENTS, BagReport, is_bag, repair_bag
 from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.rule import chosen
@@ -18,6 +18,7 @@ from imutool.mcap_io.repair import RepairReport
 from imutool.mcap_io.repair import repair as repair_log
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
+from imutool.report import NamedProgress, Progress, silent
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ def clean(
         clean=wanted,
         force=force,
         overwrite=overwrite,
-        progress=progress,
+        progress=progress or silent,
     )
     return CleanReport(tuple(report.surveys.values()), report.losses, dict(report.rewrite.added))
 
@@ -103,7 +104,7 @@ def survey_imus(
     imus: Sequence[str],
     rules: CleaningSettings,
     max_chunk: int | None = None,
-    tell: NamedProgress = lambda done, total, topic: None,
+    tell: NamedProgress = silent,
 ) -> CleanReport:
     """Survey of each IMU of a log, and the losses of a damaged log."""
     with RecoveredLog(location(source), max_chunk=max_chunk) as log:
@@ -151,9 +152,9 @@ def repair(
         (False, True)
     """
     check_outputs([OutputFile("target", target, (*output_conflicts.LOG, ".bag"))], [source], overwrite=overwrite)
-    origin, destination = location(source), location(target)
+    origin, destination, tell = location(source), location(target), progress or silent
     if not is_bag(origin):
-        return repair_log(origin, destination, damaged=damaged, max_chunk=max_chunk, overwrite=overwrite, progress=progress)
+        return repair_log(origin, destination, damaged=damaged, max_chunk=max_chunk, overwrite=overwrite, progress=tell)
     if damaged != "drop":
         raise ConfigError(NO_ATTACHMENTS, where="damaged=keep", fix="Leave `damaged` out")
-    return repair_bag(origin, destination, overwrite=overwrite, progress=progress)
+    return repair_bag(origin, destination, overwrite=overwrite, progress=tell)

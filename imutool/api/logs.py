@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from imutool.api import NamedProgress, checked
+from imutool.api import checked
 from imutool.conversion import run as conversion
-from imutool.conversion.workers import ConvertReport
+from imutool.conversion.corrections import CONVENTIONS, STAMPS
+from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
+from imutool.conversion.workers import ConvertReport, Job
 from imutool.errors import ConfigError, DataError, LogError, did_you_mean
-from imutool.exporting import ExportReport, euroc, rosbag2, simulators
+from imutool.exporting import ExportReport
 from imutool.file_location import LogPath, local, location, several
-from imutool.log_info import inspection
 from imutool.log_info.report import LogInfo
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import longest_recording, read_recordings
@@ -21,8 +23,7 @@ from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.mcap_io.temperature import with_temperatures
 from imutool.mcap_io.write import write as write_log
 from imutool.recording import Recording
-
-FORMATS = ("euroc", "rosbag2", *simulators.FORMATS)
+from imutool.report import NamedProgress, silent
 
 
 @checked
@@ -149,18 +150,17 @@ def convert(
         ['flight_1.mcap', 'flight_2.mcap']
     """
     check_outputs([OutputFile("out", out, files=("*.mcap",), keeps=True)], [source], overwrite=overwrite)
-    options: dict[str, Any] = {"compression": compression, "images": images, "overwrite": overwrite, "workers": workers}
-    marks: dict[str, Any] = {"sensor": sensor, "kinds": several(kinds), "imu": imu, "fix": fix, "restamp": restamp}
-    return conversion.convert(
-        local(source, "source"),
-        f"{local(out, 'out')}/" if str(out).endswith("/") else local(out, "out"),
-        format=format,
-        sequences=several(sequences),
+    template = Job(
+        compression=compression,
+        images=images,
+        overwrite=overwrite,
+        labels=Labels(sensor, parse_kinds(several(kinds)), parse_pair(imu)),
         mapping=mapping if mapping is None or isinstance(mapping, Mapping) else local(mapping, "mapping"),
-        progress=progress,
-        **options,
-        **marks,
+        correct=tuple(name for name, asked in ((CONVENTIONS, fix), (STAMPS, restamp)) if asked),
     )
+    place, names = f"{local(out, 'out')}/" if str(out).endswith("/") else local(out, "out"), several(sequences)
+    convert_all = partial(conversion.convert, local(source, "source"), place, template, format=format, sequences=names)
+    return convert_all(workers=workers, progress=progress or silent)
 
 
 @checked
@@ -185,6 +185,8 @@ def info(path: LogPath, *, check: bool = True, max_chunk: int | None = None) -> 
         >>> report.imu[0].topic, round(report.imu[0].rate_hz)
         ('/imu0', 200)
     """
+    from imutool.log_info import inspection
+
     return inspection.inspect(location(path), check=check, max_chunk=max_chunk)
 
 
@@ -221,12 +223,15 @@ def export(
         >>> report.imu
         '/imu0'
     """
-    if format not in FORMATS:
-        fix = did_you_mean(format, FORMATS)
-        raise ConfigError(f"unknown format {format!r}", where="format", expected=" or ".join(FORMATS), fix=fix)
+    from imutool.exporting import euroc, rosbag2, simulators
+
+    formats = ("euroc", "rosbag2", *simulators.FORMATS)
+    if format not in formats:
+        fix = did_you_mean(format, formats)
+        raise ConfigError(f"unknown format {format!r}", where="format", expected=" or ".join(formats), fix=fix)
     source, folder = local(log, "log"), local(out, "out")
     check_outputs([OutputFile("out", folder, files=("*",), keeps=True)], [source, noise], overwrite=overwrite)
-    tell: NamedProgress = progress or (lambda done, total, word: None)
+    tell = progress or silent
     if format == "euroc":
         return euroc.write(source, folder, imu, noise, overwrite, tell)
     if format in simulators.FORMATS and imu is None:

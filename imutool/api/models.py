@@ -11,25 +11,26 @@ from typing import overload
 import numpy as np
 
 from imutool import debiasing, evaluation
-from imutool.api import Init, Progress, checked, init_text
+from imutool.api import Init, checked, init_text
 from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import find_model, shipped_for
-from imutool.bias_start import Fitness
+from imutool.bias_start import DEBIASED_BY, Fitness
 from imutool.bias_start.correction import apply_with_std
 from imutool.bias_start.earlier_load import switched_on_before
-from imutool.bias_start.fitness import CHECKED_S, judge
-from imutool.bias_start.initial_bias import InitialBias, model_samples
-from imutool.bias_start.model_choice import find_initial_bias
+from imutool.bias_start.fitness import CHECKED_S
+from imutool.bias_start.initial_bias import InitialBias
+from imutool.bias_start.model_choice import find_initial_bias, fitness_in_memory
 from imutool.bias_start.stretches import measured_imu, unusual_gravity
-from imutool.debiasing import DEBIASED_BY, DebiasReport
+from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError, DataError
 from imutool.file_location import Location, LogPath, location, several
 from imutool.log_info.convention_report import contradictions, warn_of_recordings
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.recording import Imu, Recording, nanoseconds
+from imutool.report import Progress, silent
 
 Model = str | Path | BiasModel
 
@@ -215,7 +216,7 @@ def debias(
         return _debias_recording(source, model if target is None else target, start, smooth, force)
     place, out, chosen = _log_to_debias(source, target, model, in_place=in_place, overwrite=overwrite)
     run = partial(debiasing.debias, place, out, model=chosen, imus=several(imus), init=start, smooth=smooth, check=check)
-    return run(encoding=encoding, force=force, overwrite=overwrite, progress=progress)
+    return run(encoding=encoding, force=force, overwrite=overwrite, progress=progress or silent)
 
 
 def _log_to_debias(
@@ -255,7 +256,7 @@ def _debias_recording(recording: Recording, model: object, init: str, smooth: bo
     wrong = [text for whole in warn_of_recordings([begun]) for text in contradictions(whole)]
     given = next(iter(shipped_for(about)), static.Model.method) if model is None else model
     ((name, chosen, start),) = evaluation.started(recording, [given], init, recording.name, smooth=smooth, force=force)
-    fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], about).beside(wrong)
+    fitness = fitness_in_memory(chosen, start, recording, wrong)
     fitness.report(name, recording.name, force=force)
     debiased, std = apply_with_std(chosen, start, recording.imu)
     marked = {**recording.metadata, "imutool": {**about, DEBIASED_BY: name}}

@@ -9,7 +9,8 @@ from pathlib import Path
 import msgspec
 
 from imutool import diagnosis_output
-from imutool.api import NamedProgress, checked, given_logs
+from imutool.api import checked, given_logs
+from imutool.diagnosis.compared_logs import ComparedLogs
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.second_simulation import along_samples
 from imutool.file_location import LogPath, local, several
@@ -17,6 +18,7 @@ from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.processes.blas_threads import one_blas_thread
 from imutool.recording import Recording
+from imutool.report import NamedProgress, silent
 from imutool.sensor.made_up_flight import FlightSettings, flight
 from imutool.sensor.simulate import Simulation
 from imutool.sensor.simulate import simulate as simulate_log
@@ -96,7 +98,7 @@ def simulate(
         seed=seed,
         truth=truth,
         overwrite=overwrite,
-        progress=progress,
+        progress=progress or silent,
         along=None if imu is None else partial(along_samples, imu=imu),
     )
 
@@ -150,15 +152,11 @@ def diagnose(
         inputs = logs.places + sims.places
         check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], inputs, overwrite=overwrite)
         return diagnosis_output.diagnose(
-            logs.places,
-            next(iter(sims.places), None),
+            ComparedLogs(logs.places, next(iter(sims.places), None), imu, truth, several(signals)),
             folder,
             names=logs.names | sims.names,
-            imu=imu,
-            truth=truth,
-            signals=several(signals),
             close=close,
             metric=metric,
             overwrite=overwrite,
-            tell=progress,
+            tell=progress or silent,
         )[0]

@@ -15,8 +15,8 @@ from imutool.errors import ConfigError, LogError
 from imutool.file_location import Location, same_location
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.storage.target import Target
+from imutool.report import Progress, silent
 
-Progress = Callable[[int, int], None]
 NO_ATTACHMENTS = "a bag has no attachments"  # to keep damaged bytes in
 PASSES = 3  # to plan, to write, to check
 
@@ -85,7 +85,7 @@ def is_bag(where: Location) -> bool:
         source.file.close()
 
 
-def repair_bag(source: Location, target: Location, *, overwrite: bool = False, progress: Progress | None = None) -> BagReport:
+def repair_bag(source: Location, target: Location, *, overwrite: bool = False, progress: Progress = silent) -> BagReport:
     """Writes every readable message of `source` to `target`, byte for byte, with an index.
 
     A chunk of which nothing is lost keeps its bytes; any other is written unpacked with the messages found in it. The result
@@ -98,16 +98,15 @@ def repair_bag(source: Location, target: Location, *, overwrite: bool = False, p
     """
     if same_location(source, target):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
-    tell = progress or (lambda done, total: None)
     with Bag(source, recover=True) as bag, Target(target, overwrite=overwrite) as out:
         size = bag.source.size
-        index_pos, count = _plan(bag, lambda done: tell(done, PASSES * size))
+        index_pos, count = _plan(bag, lambda done: progress(done, PASSES * size))
         if not count and (bag.lost or bag.header is None):
             raise LogError("not one message can be read", where=source, expected="a bag with messages")
         used = sorted(bag.connections)
         out.write(MAGIC + records.bag_header(index_pos, len(used), count))
         with Bag(source, recover=True) as second:
-            entries, crc, rebuilt = _write(second, out, lambda done: tell(size + done, PASSES * size))
+            entries, crc, rebuilt = _write(second, out, lambda done: progress(size + done, PASSES * size))
             if (out.position, len(entries), sorted(second.connections)) != (index_pos, count, used):
                 raise LogError("the bag changed while it was read", where=source)
             for number in used:
@@ -115,7 +114,7 @@ def repair_bag(source: Location, target: Location, *, overwrite: bool = False, p
         for entry in entries:
             out.write(records.chunk_info(*entry))
         out.flush()
-        found = _read_back(out.temporary, lambda done: tell(2 * size + done * size // out.position, PASSES * size))
+        found = _read_back(out.temporary, lambda done: progress(2 * size + done * size // out.position, PASSES * size))
         if found != crc:
             raise LogError("what was written is not what was read", where=target)
         messages: Counter[str] = Counter()

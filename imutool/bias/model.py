@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 import msgspec
@@ -32,6 +32,9 @@ Vector6 = Float64[np.ndarray, "6"]  # gyro (rad/s) then accel (m/s²)
 Covariances = Float64[np.ndarray, "n 6 6"]
 Array = Float64[np.ndarray, "..."]
 Shapes = dict[str, tuple[int, ...]]
+# Roots S of the covariance S S^T of the motion-dependent bias of samples (t_s, gyro, accel), by sensor; none where it is zero.
+# The columns of S belong to the same unknowns at every sample: the covariance root of a mean is the mean of S.
+CovarianceModel = Callable[[Array, Array, Array], Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]]
 TEMPERATURE_SHAPES: Shapes = {  # of the temperature in training: range (°C, K), mean terms, and the drift that it made
     **{f"temperature.{name}": (1,) for name in ("centre", "units")},
     "temperature.mean": (12,),
@@ -83,14 +86,6 @@ class DriftStream(SampleStream, Protocol):
         """Latest rest bias."""
 
 
-@runtime_checkable
-class StretchedStream(Stream, Protocol):
-    """Bias stream with slow states that outlast a gap."""
-
-    def continue_from(self, before: Stream) -> None:
-        """Take over the states of the stream of the stretch before."""
-
-
 class LogDrift(Protocol):
     """Drift of a bias that follows from the time in one log (`imutool.bias.temperature`)."""
 
@@ -101,19 +96,6 @@ class LogDrift(Protocol):
 
     def covariance(self, t_ns: Int64[np.ndarray, " n"]) -> Covariances:
         """Covariance of the drift at some stamps, relative to its mean so far."""
-
-
-@runtime_checkable
-class CovarianceModel(Protocol):
-    """Roots S of the covariance S S^T of the motion-dependent bias of samples, by sensor.
-
-    The columns of S belong to the same unknowns at every sample: the covariance root of a mean is the mean of S.
-    """
-
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
-        """Roots at each sample, from it and earlier ones; no entry for a sensor without covariance."""
 
 
 class BiasModel(ABC):
@@ -253,8 +235,8 @@ class _Stretches:
     def _begin(self) -> None:
         self._rest = getattr(self._stream, "rest", self._rest)
         before, self._stream = self._stream, self._model.stretch(self._rest, self._start_s)
-        if isinstance(self._stream, StretchedStream):
-            self._stream.continue_from(before)
+        if take_over := getattr(self._stream, "continue_from", None):  # slow states outlast a gap
+            take_over(before)
         self._one = getattr(self._stream, "one", None)
 
 
@@ -263,7 +245,9 @@ def matrices() -> Shapes:
     return {f"W.{sensor}": (3, 3) for sensor in SENSORS}
 
 
-class _Session(msgspec.Struct):
+class Session(msgspec.Struct, frozen=True):
+    """Session of one switching-on: stamps of its logs, and the rest bias of its next log."""
+
     start_ns: int
     end_ns: int
     mean: tuple[float, float, float, float, float, float]
@@ -278,7 +262,7 @@ class _Speed(msgspec.Struct, forbid_unknown_fields=True):
 class _Priors(msgspec.Struct):
     """Entries of a card from which the start of a log is computed."""
 
-    sessions: list[_Session] = []
+    sessions: list[Session] = []
     turn_on_least_std: tuple[float, float, float, float, float, float] | None = None
     speed: _Speed | None = None
     turn_error: Annotated[float, msgspec.Meta(gt=0, le=1)] | None = None

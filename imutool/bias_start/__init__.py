@@ -9,6 +9,8 @@ from typing import Literal
 from imutool.errors import ModelError
 from imutool.report import Section
 
+SUFFIX = "/debiased"  # of the topic of a debiased IMU
+DEBIASED_BY = "debiased_by"  # in the record `imutool`: the log's own IMU is a debiased one, from `imutool.debias` of arrays
 Verdict = Literal["fits", "doubtful", "unfit"]
 
 logger = logging.getLogger(__name__)

@@ -71,7 +71,7 @@ def residual_prior(start: InitialBias | None = None, std: Float64[np.ndarray, "n
     return BiasPrior(np.zeros(6), np.maximum(minimum, MIN_STD), AT_REST_STD)
 
 
-def aided_path(imu: Imu, start: StartPose, prior: BiasPrior, aids: Aids, settings: AidSettings | None = None) -> Poses:
+def aided_path(imu: Imu, start: StartPose, prior: BiasPrior, aids: Aids) -> Poses:
     """Smoothed trajectory at the IMU's stamps from `start` at the first.
 
     `imu` is debiased; `prior` is that of the residual bias. Between the filter's blocks of half a second, and in a recording
@@ -81,7 +81,7 @@ def aided_path(imu: Imu, start: StartPose, prior: BiasPrior, aids: Aids, setting
         DataError: no samples.
         NumericsError: the numbers overflow.
     """
-    s = settings or AidSettings()
+    s = AidSettings()
     t_s = relative_samples(imu)[0]
     measure = _Measurements(imu, t_s, aids, s)
     walk = np.zeros(OFFSETS)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Int64
 from imutool.bias import static
 from imutool.bias.log_binding import at_rate, bound, rows_without_drift, without_drift
 from imutool.bias.model import BiasModel
@@ -142,7 +142,10 @@ def choose_model_and_start(
         start = _smoothed(model, _Batches(log, topic, survey, model), log.path, start_ns)
     else:
         start = find_initial_bias(init, model, first_minute)
-    return model, start if start.noise.any() else replace(start, noise=_noise(first_minute.imu))
+    if not start.noise.any():  # neither the model nor rest shows it
+        samples = np.concatenate([first_minute.imu.gyro, first_minute.imu.accel], axis=1)
+        start = replace(start, noise=white_noise(samples, period_s))
+    return model, start
 
 
 def bound_to(model: BiasModel, recording: Recording, where: str | Location = "", *, force: bool = False) -> BiasModel:
@@ -179,6 +182,11 @@ def _duration_ns(log: Log, topic: str) -> int:
 def fitness_in_log(log: Log, topic: str, model: BiasModel, start: InitialBias, survey: Survey | None) -> Fitness:
     """Fitness of a model, started in a log, for one of its IMUs."""
     return judge(model, start, _Batches(log, topic, survey, model), about_imu(log.metadata().get("imutool", {}), topic))
+
+
+def fitness_in_memory(model: BiasModel, start: InitialBias, recording: Recording, wrong: Sequence[str]) -> Fitness:
+    """Fitness of a model, started in a recording; `wrong` are its contradicted axes."""
+    return judge(model, start, [model_samples(model, recording.imu)], recording.metadata.get("imutool", {})).beside(wrong)
 
 
 def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Location) -> InitialBias:
@@ -259,11 +267,6 @@ def _samples(log: Log, topic: str, survey: Survey | None, end_ns: int | None) ->
     gyro, accel = (np.concatenate([getattr(batch, column) for batch, _ in batches]) for column in ("gyro", "accel"))
     with log.named(topic):
         return Imu(np.concatenate([t_ns for _, t_ns in batches]), gyro, accel)
-
-
-def _noise(imu: Imu) -> Float64[np.ndarray, "6"]:
-    """White noise of a sample, for a model without noise figures and a log without rest."""
-    return white_noise(np.concatenate([imu.gyro, imu.accel], axis=1), imu.period_s)
 
 
 def estimate_at_rest(imu: Imu, where: str | Location) -> tuple[BiasModel, InitialBias]:

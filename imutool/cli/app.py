@@ -27,7 +27,7 @@ from imutool.errors import INTERRUPTED, PIPE_CLOSED, ConfigError, ImutoolError, 
 from imutool.file_location import first_bytes
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
-from imutool.report import Report
+from imutool.report import NamedProgress, Report
 
 NOTHING_LEFT, MAKE_ROOM = "Nothing half-written is left", "Choose another place or make room"
 FIXES = {FileNotFoundError: "Look whether it is still there", PermissionError: "See who may read it, or write there"}
@@ -236,7 +236,7 @@ class Common:
     verbose: Verbose = False
     quiet: Quiet = False
 
-    def progress(self, what: str) -> AbstractContextManager[Callable[[int, int, str], None]]:
+    def progress(self, what: str) -> AbstractContextManager[NamedProgress]:
         """Progress bar on stderr."""
         return progress(what, self.verbose, self.quiet)
 

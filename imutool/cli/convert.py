@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -12,43 +11,14 @@ from imutool.cli.app import COMMON, Common, Written, app, listing
 from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import say, tell_error, tell_warning
 from imutool.config import entries
-from imutool.conversion import Failure
 from imutool.errors import LOST, DataError
 from imutool.mcap_io.storage.local import is_stream
-from imutool.report import Report
 
 if TYPE_CHECKING:
     from imutool.conversion.workers import ConvertReport
 
 LOGS = Written(files=("*.mcap",), keeps=True)  # a file, or a folder of files
 FOLDER = Written(files=("*",), keeps=True)
-
-
-class Compression(StrEnum):
-    """Compression of a log's chunks."""
-
-    zstd = "zstd"
-    lz4 = "lz4"
-    none = "none"
-
-
-class Conversion(Report, frozen=True, tag="imutool.conversion/1"):
-    """Report of `imutool convert`."""
-
-    written: list[str]
-    failures: list[Failure]
-    notes: list[str]
-    losses: list[str]
-
-
-class Export(Report, frozen=True, tag="imutool.export/1"):
-    """Report of `imutool export`: messages or rows by file, and the topics left out."""
-
-    output: str
-    format: str
-    imu: str | None
-    written: dict[str, int]
-    left_out: list[str]
 
 
 @app.command(
@@ -61,7 +31,7 @@ def convert(
     target: Annotated[str, typer.Argument(metavar="OUT", help="File for one sequence, folder (or NAME/) for several."), LOGS],
     format: Annotated[str, typer.Option(help="auto, or a name from the list below.")] = "auto",
     sequence: Annotated[list[str] | None, typer.Option(help="Convert only this sequence. Repeatable.")] = None,
-    compression: Annotated[Compression, typer.Option(help="Compression of the chunks.")] = Compression.zstd,
+    compression: Annotated[Literal["zstd", "lz4", "none"], typer.Option(help="Compression of the chunks.")] = "zstd",
     no_images: Annotated[bool, typer.Option("--no-images", help="Leave camera frames out.")] = False,
     sensor: Annotated[str, typer.Option(metavar="NAME", help="The IMU's name, such as bmi160.")] = "",
     kind: Annotated[
@@ -81,7 +51,7 @@ def convert(
     common: Common = COMMON,
 ) -> None:
     """Convert any recording with an IMU to MCAP; the format is recognised."""
-    from imutool.conversion.run import convert as run
+    from imutool.api.logs import convert as run
 
     with common.progress("Converting") as tell:
         report = run(
@@ -89,7 +59,7 @@ def convert(
             target,
             format=format,
             sequences=sequence or (),
-            compression=compression.value,
+            compression=compression,
             images=not no_images,
             overwrite=common.overwrite,
             sensor=sensor,
@@ -113,8 +83,7 @@ def _mapping(words: list[str]) -> Path | dict[str, Any] | None:
 
 def _tell(report: ConvertReport, common: Common) -> None:
     """Report written logs, notes, losses and failures; the exit code says which there are."""
-    summary = Conversion([str(path) for path in report.written], report.failures, report.notes, report.losses)
-    if not common.write(summary):
+    if not common.write(report):
         for path in report.written:
             say(str(path))
     if not common.quiet:
@@ -167,8 +136,7 @@ def export(
 
     with common.progress("Exporting") as tell:
         report = run(log, target, format=format, imu=imu, noise=noise, overwrite=common.overwrite, progress=tell)
-    summary = Export(str(report.output), report.format, report.imu, report.written, report.left_out)
-    if common.write(summary):
+    if common.write(report):
         return
     counts = ", ".join(name if "." in name else f"{count} on {name}" for name, count in report.written.items())
     say(f"{target}: {counts}" + (f"; IMU from {report.imu}" if report.imu else ""))

@@ -15,6 +15,7 @@ from imutool.cli.app import COMMON, HTML, LOG, RRD, Common, Imus, Init, MaxChunk
 from imutool.cli.terminal import say, tell_losses
 from imutool.errors import LOST, ConfigError
 from imutool.file_location import Location, to_location
+from imutool.mcap_io import Verified
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
 from imutool.viewing import Output
 
@@ -123,14 +124,6 @@ class DebiasedImu(Section, frozen=True):
     stretches: list[StretchEntry] | UnsetType = UNSET  # each but the first: gaps and jumps of the clock
 
 
-class Verified(Section, frozen=True):
-    """Chunks of the new log that were read back."""
-
-    mode: str
-    chunks_checked: int
-    chunks: int
-
-
 class DebiasSummary(Report, frozen=True, kw_only=True, tag="imutool.debias/1"):
     """Report of `imutool debias`; `shown`, `report` and `clean` only if requested."""
 
@@ -166,7 +159,7 @@ def _summary(
         imus=imus,
         copied=report.rewrite.copied,
         added=dict(report.rewrite.added),
-        verified=Verified(*report.rewrite.verified),
+        verified=report.rewrite.verified,
         losses=report.losses.plain(),
         shown=UNSET if shown is None else list(shown),
         report=UNSET if page is None else str(page),

@@ -74,7 +74,7 @@ def run(
         ConfigError: the folder holds an earlier demo, or the extras train, view and report are not installed.
     """
     _check(out, overwrite)  # before the packages of the work are loaded
-    from imutool.conversion.run import convert
+    from imutool.api.logs import convert
     from imutool.debiasing import debias
     from imutool.evaluation import evaluate
     from imutool.training.run import train

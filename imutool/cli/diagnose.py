@@ -67,6 +67,7 @@ def diagnose(
     from imutool import diagnosis_output
     from imutool.config import load as load_settings
     from imutool.diagnosis.closed_loop import script_metric
+    from imutool.diagnosis.compared_logs import ComparedLogs
     from imutool.diagnosis.settings import DiagnoseSettings
     from imutool.file_location import local, refuse_twins, to_location
     from imutool.processes.forked import forking
@@ -76,13 +77,8 @@ def diagnose(
     settings = load_settings(DiagnoseSettings, config, set_ or ())
     with forking(), common.progress("Diagnosing") as tell:
         diagnosis, remarks = diagnosis_output.diagnose(
-            logs,
-            None if sim is None else to_location(sim),
+            ComparedLogs(logs, None if sim is None else to_location(sim), imu, truth, signal or (), settings),
             folder,
-            imu=imu,
-            truth=truth,
-            signals=signal or (),
-            settings=settings,
             close=close,
             metric=None if metric is None else script_metric(metric, local(logs[0], "metric")),
             overwrite=common.overwrite,

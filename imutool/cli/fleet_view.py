@@ -15,10 +15,9 @@ from imutool.cli.app import COMMON, Common, Written
 from imutool.cli.fleet import fleet
 from imutool.cli.terminal import say, table, tell_warning
 from imutool.errors import ConfigError
-from imutool.report import Report, Section
 
 if TYPE_CHECKING:
-    from imutool.fleet.rerun_catalog import Catalog, Segment
+    from imutool.fleet.rerun_catalog import Catalog, CatalogReport, WorstLog
     from imutool.fleet.rerun_layers import Layers
 
 WAITS_S = 3600.0  # Ctrl-C ends it at once
@@ -27,32 +26,6 @@ CACHE_HELP = "Folder for the layers' files; by default DIR/catalog. They are wri
 LAYERS = Written(files=("*.rrd", "layout.rbl"), keeps=True)  # named by digests: a file stays, or is the same
 COLUMNS = {"status": "status", "aoe_raw_deg": "AOE raw\n°", "aoe_deg": "AOE\n°", "score": "score"}
 COLUMNS |= {"gyro_bias_deg_s": "gyro bias\n°/s", "effects": "effects", "losses": "losses", "robot": "robot"}
-
-
-class WorstLog(Section, frozen=True):
-    """Log of a catalog with the address that a viewer opens, its layers and properties."""
-
-    name: str
-    url: str
-    layers: list[str]
-    values: dict[str, float | str]
-
-
-class NotShown(Section, frozen=True):
-    """Log without a segment, and the reason."""
-
-    name: str
-    reason: str
-
-
-class CatalogReport(Report, frozen=True, tag="imutool.catalog/1"):
-    """Report of `imutool fleet view`: address, number of segments, and the worst logs."""
-
-    url: str
-    segments: int
-    by: str
-    worst: list[WorstLog]
-    not_shown: list[NotShown]
 
 
 @fleet.command("view", epilog="Example: [bold]imutool fleet view debiased/ --web[/]")
@@ -90,20 +63,20 @@ def view(
     if not shown:
         raise ConfigError("no log of the fleet can be shown", where=folders[0])
     with rerun_catalog.Catalog(shown, store, port) as served:
-        measure, segments = served.worst(by, worst)
-        report = CatalogReport(
+        measure, logs_worst = served.worst(by, worst)
+        report = rerun_catalog.CatalogReport(
             url=served.url,
             segments=len(shown),
             by=measure,
-            worst=[WorstLog(*segment) for segment in segments],
-            not_shown=[NotShown(log.name, log.trouble) for log in built if log.trouble],
+            worst=logs_worst,
+            not_shown=[rerun_catalog.NotShown(log.name, log.trouble) for log in built if log.trouble],
         )
         if not common.write(report):
             _show(report, rerun_catalog.MEASURES[measure].meaning)
         sys.stdout.flush()  # a program that reads it through a pipe wants the address now
         if not list_only:
             with contextlib.suppress(KeyboardInterrupt):
-                _open(served, segments, web)
+                _open(served, logs_worst, web)
 
 
 def _show(report: CatalogReport, meaning: str) -> None:
@@ -119,12 +92,12 @@ def _cell(value: float | str | None) -> str:
     return "–" if value is None else format(value, ".4g") if isinstance(value, float) else str(value)
 
 
-def _open(served: Catalog, segments: Sequence[Segment], web: bool) -> None:
-    """Open the segments in a viewer or a browser, and serve until Ctrl-C or until the viewer is closed."""
+def _open(served: Catalog, logs: Sequence[WorstLog], web: bool) -> None:
+    """Open the logs in a viewer or a browser, and serve until Ctrl-C or until the viewer is closed."""
     from imutool.viewing.rerun import viewer
     from imutool.viewing.rerun.web import Server, catalog_site, policy_with
 
-    urls = [served.url, *(segment.url for segment in reversed(segments))]  # the last one is in front
+    urls = [served.url, *(log.url for log in reversed(logs))]  # the last one is in front
     say(f"The catalog: {served.url}")
     if web:
         with Server() as page:

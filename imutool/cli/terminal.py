@@ -7,7 +7,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ from imutool.errors import ConfigError, ImutoolError, redact
 from imutool.file_location import to_location
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.storage.target import Target
-from imutool.report import Report, json_text
+from imutool.report import NamedProgress, Report, json_text, silent
 
 if TYPE_CHECKING:
     from imutool.training.fit import Epoch
@@ -210,14 +210,14 @@ def log_to_stderr(verbose: bool, quiet: bool) -> None:
 
 
 @contextmanager
-def progress(what: str, verbose: bool, quiet: bool) -> Iterator[Callable[[int, int, str], None]]:
+def progress(what: str, verbose: bool, quiet: bool) -> Iterator[NamedProgress]:
     """Progress bar on stderr; the callback takes steps done, steps in all, and a word.
 
     With --verbose the words stay as lines.
     """
     log_to_stderr(verbose, quiet)
     if quiet:
-        yield lambda done, total, word: None
+        yield silent
         return
     from rich.progress import BarColumn, Progress, TextColumn
 

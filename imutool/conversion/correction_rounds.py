@@ -17,10 +17,10 @@ from imutool import registry
 from imutool.array_types import Float64
 from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.likelihood import axis_names
-from imutool.conversion.common_setup import combined, fitted_to
 from imutool.conversion.corrections import CONVENTIONS, NOT_TURNED, STAMPS, Corrections, pose_notes
 from imutool.conversion.message_writer import BULKY, write_log
 from imutool.conversion.restamping import find_stamps
+from imutool.conversion.shared_corrections import combined, fitted_to
 from imutool.log_info.imu_samples import ImuSamples
 from imutool.log_info.pose_imu_rotation import Body, agreement_in, body_of, frames_of_copies, is_straight, turned_body
 from imutool.mcap_io.codec import schemas

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path, PurePosixPath
@@ -15,17 +15,24 @@ from types import ModuleType
 from typing import Any
 
 from imutool import registry
-from imutool.conversion import Failure
-from imutool.conversion.corrections import CONVENTIONS, STAMPS
 from imutool.conversion.unread_formats import blamed, is_pointer, left_out_below, nothing_found, pointers_in
-from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
-from imutool.conversion.workers import GROUP, SUFFIX, ConvertReport, Job, Progress, check_targets, run_jobs, write_content
+from imutool.conversion.workers import (
+    GROUP,
+    SUFFIX,
+    ConvertReport,
+    Failure,
+    Job,
+    check_targets,
+    run_jobs,
+    write_content,
+)
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
 from imutool.file_location import local
 from imutool.mcap_io.storage.local import is_stream, removed_if_empty
 from imutool.processes.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
+from imutool.report import NamedProgress, silent
 
 AUTO = "auto"
 
@@ -56,37 +63,22 @@ class _Sequences:
 def convert(
     source: Path,
     out: str | Path,
+    template: Job,
     *,
     format: str = AUTO,
     sequences: Sequence[str] = (),
-    compression: str = "zstd",
-    images: bool = True,
-    overwrite: bool = False,
-    sensor: str = "",
-    kinds: Sequence[str] = (),
-    mapping: Path | Mapping[str, Any] | None = None,
-    imu: str = "",
-    fix: bool = False,
-    restamp: bool = False,
     workers: int | None = None,
-    progress: Progress | None = None,
+    progress: NamedProgress = silent,
 ) -> ConvertReport:
-    """Convert one sequence to the file `out`, or several to the folder `out`.
+    """Convert one sequence to the file `out`, or several to the folder, as `imutool.convert`.
 
-    `sensor` names the IMU where the data set does not, and `kinds` (`TOPIC=truth|estimate|odometry|unknown`) says what poses
-    are worth. `mapping` (a file, or its entries) states what a table's columns mean. `out` with a slash at its end is a folder.
-    `imu` (`gyro=TOPIC,accel=TOPIC`) joins two sensors to one IMU; pairs that differ in name by the sensor alone join unasked.
-    `fix` corrects units, axes and frames that the log's motion shows to be wrong, `restamp` late stamps.
-    `workers` is the number of processes, by default one a processor; with 1, or for one sequence, all happens here.
+    `template` is what the job of each sequence has in common; `out` with a slash at its end is a folder.
 
     Raises:
         DataError: no converter recognises anything in the source.
         ConfigError: unknown format or sequence, a pipe, two of one name, a target that exists or cannot be made.
         ImutoolError: the only sequence there is (or was asked for) failed; of several, failures go to the report.
     """
-    labels = Labels(sensor, parse_kinds(kinds), parse_pair(imu))
-    corrected = tuple(name for name, asked in ((CONVENTIONS, fix), (STAMPS, restamp)) if asked)
-    template = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
         return _from_stream(module, source, out, sequences, replace(template, converter=format), progress)
     if is_stream(source) and not source.is_file():  # its reader would wait, and a converter reads it more than once
@@ -121,7 +113,7 @@ def _convert_found(
     sequences: Sequence[str],
     template: Job,
     workers: int | None,
-    progress: Progress | None,
+    progress: NamedProgress,
 ) -> ConvertReport:
     """Write a log of each sequence, or of those asked for."""
     if sequences:
@@ -142,7 +134,7 @@ def _convert_found(
     pointers = pointers_in(source) if errors else []
     if len(names) == 1 and failed:
         raise blamed(failed[0][1], pointers)
-    report = ConvertReport(failures=[Failure(name, str(blamed(error, pointers))) for name, error in errors])
+    report = ConvertReport([], [Failure(name, str(blamed(error, pointers))) for name, error in errors], [], [])
     for number, outcome in sorted(outcomes.items()):
         if outcome.error is None:
             report.add(jobs[number].target, outcome)
@@ -262,7 +254,7 @@ def _from_stream(
     out: str | Path,
     wanted: Sequence[str],
     template: Job,
-    progress: Progress | None,
+    progress: NamedProgress,
 ) -> ConvertReport:
     """Convert one after the other, with a converter that only has `read`.
 
@@ -272,7 +264,7 @@ def _from_stream(
     first = list(islice(recordings, 2))
     if not first:
         raise DataError("no sequence found", where=source, expected=" or ".join(wanted) or "at least one")
-    report = ConvertReport()
+    report = ConvertReport([], [], [], [])
     for recording in chain(first, recordings):
         (target,) = _targets([recording.name], out, many=len(first) > 1)
         if target in report.written:
@@ -281,8 +273,7 @@ def _from_stream(
         check_targets([job := replace(template, sequence=recording, target=target)], source)
         kept = replace(recording, frames={}) if isinstance(recording, Recording) and not template.images else recording
         report.add(target, write_content(kept, job))
-        if progress is not None:
-            progress(len(report.written), len(report.written), recording.name)
+        progress(len(report.written), len(report.written), recording.name)
     missing = set(wanted) - {path.stem for path in report.written} if len(first) > 1 else set(wanted) - {first[0].name}
     report.failures.extend(Failure(name, f"{source}: holds no such sequence") for name in sorted(missing))
     return report

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,11 +11,10 @@ from typing import Any
 
 from imutool import registry
 from imutool.config import toml
-from imutool.conversion import Failure
-from imutool.conversion.common_setup import most_alike, shared
 from imutool.conversion.correction_rounds import write_corrected
 from imutool.conversion.corrections import Corrections
 from imutool.conversion.message_writer import write_log
+from imutool.conversion.shared_corrections import most_alike, shared
 from imutool.conversion.user_labels import Labels
 from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.file_location import first_bytes
@@ -30,6 +29,7 @@ from imutool.mcap_io.write import write
 from imutool.processes.worker_pool import WorkerBugError, WorkerPool
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
+from imutool.report import NamedProgress, Report, Section
 
 GROUP = "imutool.converters"
 SUFFIX = ".mcap"
@@ -37,15 +37,14 @@ MAP = "imutool/map"  # record of what a table's columns were taken for
 SAME_COLUMNS = "its columns and units are taken for those of the other tables, which show them"
 ORDER = "quaternion_wxyz"  # entry of that record
 SAME_ORDER = "the order of its quaternions is that which most of the other tables show, as one program wrote them"
-Progress = Callable[[int, int, str], None]  # sequences done, sequences in all, the name of the one that just ended
 
 
 @dataclass(frozen=True)
 class Job:
     """Job of a worker process: one log."""
 
-    converter: str
-    sequence: Any  # the converter's own handle: has a `name`, and pickles
+    converter: str = ""
+    sequence: Any = None  # the converter's own handle: has a `name`, and pickles
     target: Path = Path()
     compression: str = "zstd"
     images: bool = True
@@ -55,6 +54,13 @@ class Job:
     correct: tuple[str, ...] = ()  # `conventions`, `stamps`
     common: Corrections | None = None  # of the other logs of its setup
     note: str = ""  # on the job itself
+
+
+class Failure(Section, frozen=True):
+    """Failed sequence, with the reason."""
+
+    name: str
+    message: str
 
 
 @dataclass(frozen=True)
@@ -68,14 +74,13 @@ class Outcome:
     mapping: Mapping[str, str] = field(default_factory=dict)  # of a table: what its columns were taken for
 
 
-@dataclass(frozen=True)
-class ConvertReport:
+class ConvertReport(Report, frozen=True, tag="imutool.conversion/1"):
     """Written logs, in the order of the source, and failures."""
 
-    written: list[Path] = field(default_factory=list)
-    failures: list[Failure] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)  # what is worth knowing about a log
-    losses: list[str] = field(default_factory=list)  # what of a source is not in its log
+    written: list[Path]
+    failures: list[Failure]
+    notes: list[str]  # what is worth knowing about a log
+    losses: list[str]  # what of a source is not in its log
 
     def add(self, target: Path, outcome: Outcome) -> None:
         """Enter a written log and the remarks on it."""
@@ -90,7 +95,7 @@ class ConvertReport:
         return ConvertReport(self.written, failures, notes, losses)
 
 
-def run_jobs(jobs: Sequence[Job], of: int, workers: int, progress: Progress | None) -> dict[int, Outcome]:
+def run_jobs(jobs: Sequence[Job], of: int, workers: int, progress: NamedProgress) -> dict[int, Outcome]:
     """Outcomes of jobs by their numbers.
 
     `of` counts also sequences that cannot be read, and are no jobs. A log that lacks what most of the others show of their
@@ -138,13 +143,12 @@ def _with_common_corrections(jobs: Sequence[Job], outcomes: Mapping[int, Outcome
     return {n: replace(jobs[n], common=common, overwrite=True) for n in lacking}
 
 
-def _run(jobs: Sequence[Job], of: int, workers: int, progress: Progress | None) -> Iterator[tuple[int, Outcome]]:
+def _run(jobs: Sequence[Job], of: int, workers: int, progress: NamedProgress) -> Iterator[tuple[int, Outcome]]:
     """Yield each job's number and outcome, as the jobs end."""
     each = min(workers, len(jobs))
     done = ((n, _convert_one(job)) for n, job in enumerate(jobs)) if each <= 1 else _run_in_processes(jobs, each)
     for count, (number, outcome) in enumerate(done, start=1):
-        if progress is not None:
-            progress(of - len(jobs) + count, of, jobs[number].sequence.name)
+        progress(of - len(jobs) + count, of, jobs[number].sequence.name)
         yield number, outcome
 
 

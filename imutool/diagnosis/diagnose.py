@@ -5,7 +5,7 @@ logs ─ align_all ─> Pair[] ─ whitened ─> WhitenedImu[] ─ select_effect
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -17,9 +17,10 @@ from imutool.diagnosis import summarize
 from imutool.diagnosis.audit import simulator_remarks
 from imutool.diagnosis.audit.simulation import imu_in, read_simulation
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
+from imutool.diagnosis.compared_logs import ComparedLogs, imu_topics
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
-from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
@@ -30,7 +31,7 @@ from imutool.diagnosis.estimation.trial.effect_forms import in_forms
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.held_out import resimulate
-from imutool.diagnosis.imu_relation import compared_imu, imu_relation, imu_sentence, imu_topics
+from imutool.diagnosis.imu_relation import imu_relation, imu_sentence
 from imutool.diagnosis.reference.another_motion import compared
 from imutool.diagnosis.reference.conventions import with_common_conventions
 from imutool.diagnosis.reference.coverage import (
@@ -55,6 +56,7 @@ from imutool.log_info.convention_report import check_one_sensor, check_units, co
 from imutool.mcap_io.read import read
 from imutool.processes.forked import Forked
 from imutool.recording import Recording
+from imutool.report import NamedProgress, silent
 from imutool.sensor import catalogue
 from imutool.sensor.channels import with_channels
 from imutool.sensor.effect import Effect
@@ -63,7 +65,6 @@ from imutool.sensor.effects import clock_wander, gyro_bias_drift, gyro_bias_step
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 NEEDS_POSES = clock_wander.EFFECT.name  # one clock cannot wander against itself
 NEEDS_SIMULATION = "gyro_dead_band"  # a zero crossing takes milliseconds, beyond what poses know
-Tell = Callable[[int, int, str], None]
 
 
 def diagnose(
@@ -73,8 +74,8 @@ def diagnose(
     imu: str | None = None,
     truth: str | None = None,
     signals: Sequence[str] = (),
-    tell: Tell | None = None,
-    settings: DiagnoseSettings | None = None,
+    tell: NamedProgress = silent,
+    settings: DiagnoseSettings = DEFAULT,
     begin: Sequence[Finding] = (),
 ) -> Diagnosis:
     """Effects that separate recordings from a simulation, or from their own true poses.
@@ -87,13 +88,13 @@ def diagnose(
         ConfigError, LogError: a log cannot be read, or has no such topic; signals without a simulation, or of several logs.
         DataError: no truth and no simulation, too little shared time, another motion, no usable axis, different sensors.
     """
-    report, settings = tell or (lambda done, total, text: None), settings or DiagnoseSettings()
-    report(0, 4, "reading")
-    check_signals(signals, reals, sim)
+    asked = ComparedLogs(reals, sim, imu, truth, signals, settings)
+    tell(0, 4, "reading")
+    check_signals(asked)
     topics = imu_topics(reals[0])
     if sim is not None and not (topics and imu_topics(sim)):
-        return with_signals(Diagnosis.without_imu(reals, sim), reals[0], sim, signals, report, settings)
-    first = compared_imu(reals, imu)
+        return with_signals(Diagnosis.without_imu(reals, sim), asked, tell)
+    first = asked.compared_imu()
     logs_read = [with_channels(read_log(real, imu=first, truth=truth), real) for real in reals]
     recordings = with_unique_names([log.recording for log in logs_read])
     check_one_sensor(recordings)
@@ -103,36 +104,35 @@ def diagnose(
         diagnosis = check_without_reference(recordings[0], str(reals[0]), "no simulation and no true poses", settings)
     else:
         remarks_read = [*(log.remark for log in logs_read if log.remark), *(wrong if sim is None else ())]
-        diagnosis, _ = _beside_reference(recordings, reals, sim, imu, truth, signals, remarks_read, report, settings, begin)
+        diagnosis, _ = _beside_reference(asked, recordings, remarks_read, tell, begin)
     if others and first is not None:
         diagnosis = _with_other_imus(diagnosis, recordings[0], reals[0], first, others, settings)
-    report(4, 4, "")
+    tell(4, 4, "")
     return diagnosis
 
 
 def _beside_reference(
+    asked: ComparedLogs,
     recordings: Sequence[Recording],
-    reals: Sequence[Location],
-    sim: Location | None,
-    imu: str | None,
-    truth: str | None,
-    signals: Sequence[str],
-    remarks_read: Sequence[str],
-    report: Tell,
-    settings: DiagnoseSettings,
-    begin: Sequence[Finding],
+    remarks_read: Sequence[str] = (),
+    report: NamedProgress = silent,
+    begin: Sequence[Finding] = (),
 ) -> tuple[Diagnosis, Selection | None]:
     """Diagnosis of recordings against a simulation or their own poses; `remarks_read` are those of reading them.
 
     The selection of effects comes with it; none without a reference.
     """
+    reals, sim, imu, truth, signals, settings = asked
     simulated = None if sim is None else read_simulation(sim, imu=imu_in(sim, imu))[0]
     warn_of_recordings([] if simulated is None else [simulated])
     of_sim, sim_selection, another = tuple[Finding, ...](), None, list[str]()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
         report(0, 4, "the simulation, of another motion")
         another = [ANOTHER_MOTION, *simulator_remarks(simulated)]
-        of_sim, sim_selection = _by_itself(sim, imu_in(sim, imu), next(iter(simulated.truths)), settings)
+        own = ComparedLogs([sim], None, imu_in(sim, imu), next(iter(simulated.truths)), (), settings)
+        of_itself = with_channels(read_log(sim, imu=own.imu, truth=own.truth), sim).recording
+        alone, sim_selection = _beside_reference(own, [of_itself])
+        of_sim = alone.findings
         simulated = None
     pairs, left_out = align_all(recordings, simulated, truth, settings)
     if not pairs:
@@ -166,17 +166,8 @@ def _beside_reference(
     findings, located = (*conventions, *wrong, *diagnosis.findings), places if wrong else diagnosis.located or places
     diagnosis = replace(diagnosis, findings=findings, located=located, remarks=remarks, caveat=caveat)
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
-        diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings, clock_difference(pairs, selection.whole))
+        diagnosis = with_signals(diagnosis, asked, report, clock_difference(pairs, selection.whole))
     return diagnosis, selection
-
-
-def _by_itself(
-    sim: Location, imu: str | None, truth: str, settings: DiagnoseSettings
-) -> tuple[tuple[Finding, ...], Selection | None]:
-    """Findings and selected effects of a simulation against its own poses."""
-    alone = [with_channels(read_log(sim, imu=imu, truth=truth), sim).recording]
-    diagnosis, selection = _beside_reference(alone, [sim], None, imu, truth, (), (), lambda *_: None, settings, ())
-    return diagnosis.findings, selection
 
 
 def _with_other_imus(

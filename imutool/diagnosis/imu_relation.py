@@ -16,25 +16,11 @@ from imutool.diagnosis.estimation.time_alignment import with_simulation
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.wording.quantity import Quantity, value
-from imutool.file_location import Location
-from imutool.mcap_io.log import Log
 from imutool.recording import Imu, Recording, interpolate, seconds
 from imutool.sensor import catalogue
 from imutool.units import AXES
 
 STEP_RAD = 1e-6
-
-
-def imu_topics(log: Location) -> list[str]:
-    """Topics of the IMUs of a log."""
-    with Log(log) as opened:
-        return opened.imu_topics
-
-
-def compared_imu(reals: Sequence[Location], imu: str | None) -> str | None:
-    """Topic of the IMU that is diagnosed: `imu`, or the first of several in one recording."""
-    topics = imu_topics(reals[0])
-    return imu or (topics[0] if len(topics) > 1 and len(reals) == 1 else None)
 
 
 def imu_relation(first: Recording, other: Recording, effects: Sequence[str], settings: DiagnoseSettings) -> dict[str, Estimate]:

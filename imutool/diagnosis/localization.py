@@ -9,6 +9,7 @@ variables tried).
 from __future__ import annotations
 
 from collections.abc import Container, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -26,7 +27,18 @@ CALM_SHARE = 0.25  # of the seconds, that a misfit which comes and goes leaves a
 EDGE_S = 0.05  # from which on an interval begins later than its window, or ends earlier
 FAR_MORE = 2.0  # times the squares that means hold, from which the samples count: what is so fast is lost in a mean
 TIMES = ("after", "in the first")  # how a regime of the time begins, above and below its threshold
+LOCALIZATION = LocalizationSettings()
 Samples = Float64[np.ndarray, "_ k"]
+
+
+class Misfit(NamedTuple):
+    """Real minus expected samples; they have noise where means are formed (`averaged`)."""
+
+    t_s: Float64[np.ndarray, " n"]
+    samples: Float64[np.ndarray, "n k"]
+    noise: Float64[np.ndarray, " k"]  # standard deviation of a sample, by column
+    signals: Mapping[str, slice] = IMU_SIGNALS  # columns by signal; the axes of a signal of three are named
+    averaged: Sequence[int] = ()  # samples of running means, the longest first
 
 
 def locate_findings(
@@ -93,7 +105,8 @@ def _locate_log(
     common = set.intersection(*map(set, each))  # a channel that is constant, or starts late, is not in every segment
     variables = {n: (unit, np.concatenate([own[n][1] for own in each])) for n, (unit, _) in each[0].items() if n in common}
     first = segments[0][0]
-    return locate(t_s, misfit, floor, variables, p_values, first.settings.localization, first.signals, certain, averaged)
+    placed = Misfit(t_s, misfit, floor, first.signals, averaged)
+    return locate(placed, variables, p_values, certain, first.settings.localization)
 
 
 def _converter_output(samples: Float64[np.ndarray, "n k"], findings: Sequence[Finding]) -> Float64[np.ndarray, "n k"]:
@@ -111,34 +124,25 @@ def _converter_output(samples: Float64[np.ndarray, "n k"], findings: Sequence[Fi
 
 
 def locate(
-    t_s: Float64[np.ndarray, " n"],
-    misfit: Float64[np.ndarray, "n k"],
-    noise: Float64[np.ndarray, " k"],
+    misfit: Misfit,
     variables: Variables,
     p_values: Mapping[str, float],
-    settings: LocalizationSettings | None = None,
-    signals: Mapping[str, slice] = IMU_SIGNALS,
     certain: Container[str] = (),
-    averaged: Sequence[int] = (),
+    settings: LocalizationSettings = LOCALIZATION,
 ) -> list[Located]:
     """Locations of a misfit by signal, strongest first; samples may span several segments.
 
     Args:
-        t_s: stamps of the samples.
-        misfit: real minus expected samples, without noise; with `averaged` they have noise.
-        noise: standard deviation of a sample, by column.
+        misfit: samples of one log, with their noise.
         variables: what a regime can be of, by name, with unit and values at the samples.
         p_values: of the misfit by signal.
-        settings: those of a diagnosis by default.
-        signals: columns by signal; the axes of a signal of three are named.
         certain: signals that have a misfit; where no single second shows it, it lies everywhere.
-        averaged: samples of running means, the longest first.
+        settings: those of a diagnosis by default.
     """
-    settings = settings or LocalizationSettings()
-    located = []
-    scaled = _without_bias(misfit / noise)
+    located, t_s, averaged = list[Located](), misfit.t_s, misfit.averaged
+    scaled = _without_bias(misfit.samples / misfit.noise)
     seconds, window = np.unique(np.floor((t_s - t_s[0]) / settings.window_s), return_inverse=True)
-    for signal, columns in signals.items():
+    for signal, columns in misfit.signals.items():
         by_axis = np.stack([np.bincount(window, weights=column) for column in (scaled[:, columns] ** 2).T], axis=1)
         inside = by_axis.sum(axis=1) > settings.clear_squares
         if averaged:

@@ -29,8 +29,7 @@ from imutool.noise.datasheet import Noise
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 from imutool.sensor import physics_file
 from imutool.sensor.channels import needs_channels, with_channels
-from imutool.sensor.effect import Acting
-from imutool.sensor.physics_file_terms import additive_noise
+from imutool.sensor.physics_file_terms import SimulatedSensor, additive_noise
 from imutool.sensor.simulate import MIN_S, Simulation, even_stamps, of_noise, simulate, simulated, taken
 
 OF_NOISE = 1.5  # times a simulation's own noise, by which an ideal sensor along its poses may differ from its samples
@@ -60,11 +59,7 @@ def simulate_again(
 def along_samples(
     sim: Path,
     truth: str | None,
-    acting: Acting,
-    start_ns: int | None,
-    noise: Noise,
-    rate_hz: float | None,
-    seed: int,
+    sensor: SimulatedSensor,
     *,
     imu: str | None,
     beside: Recording | None = None,
@@ -81,23 +76,26 @@ def along_samples(
     found, _ = read_simulation(sim, imu=imu, truth=truth)  # of the sensor, in a world whose z is up
     alone = beside is None or not same_motion(beside.imu, found.imu, settings.alignment)
     if beside is None or alone:
-        beside = with_channels(found, sim).recording if needs_channels(acting) else found
+        beside = with_channels(found, sim).recording if needs_channels(sensor.acting) else found
     short = msgspec.structs.replace(settings, alignment=msgspec.structs.replace(settings.alignment, min_s=MIN_S))
     pairs = with_simulation(beside, found, short, own_poses=alone)
     ideals, clock_ns = [pair.ideal for pair in pairs], int(beside.imu.t_ns[0])
     sim_ns = clock_ns + nanoseconds(pairs[0].aligned_s)
     own_s = seconds(found.imu.t_ns, sim_ns)
-    stamps = [even_stamps(x, rate_hz) if rate_hz else own_s[(own_s >= x.t_s[0]) & (own_s <= x.t_s[-1])] for x in ideals]
-    rate_hz = 1.0 / found.imu.period_s if rate_hz is None else rate_hz
-    started_s = None if start_ns is None else (start_ns - clock_ns) * 1e-9
-    out = taken(ideals, stamps, [*acting, (additive_noise(noise, rate_hz, seed), np.zeros(0))], started_s)
+    stamps = [
+        even_stamps(x, sensor.rate_hz) if sensor.rate_hz else own_s[(own_s >= x.t_s[0]) & (own_s <= x.t_s[-1])] for x in ideals
+    ]
+    rate_hz = sensor.rate_hz or 1.0 / found.imu.period_s
+    started_s = None if sensor.start_ns is None else (sensor.start_ns - clock_ns) * 1e-9
+    noise = additive_noise(sensor.noise, rate_hz, sensor.seed)
+    out = taken(ideals, stamps, [*sensor.acting, (noise, np.zeros(0))], started_s)
     t_ns = sim_ns + np.round(out.stamp_s * 1e9).astype(np.int64)
     return Simulation(
         replace(found, imu=Imu(t_ns, out.gyro, out.accel), scalars={}, frames={}),
         None,
         tuple((float(x.t_s[0] - ideals[0].t_s[0]), float(x.t_s[-1] - ideals[0].t_s[0])) for x in ideals),
-        {"truth": next(iter(found.truths), None), "imu": found.imu_topic, "rate_hz": rate_hz, "seed": seed},
-        tuple(of_noise(noise, rate_hz)),
+        {"truth": next(iter(found.truths), None), "imu": found.imu_topic, "rate_hz": rate_hz, "seed": sensor.seed},
+        tuple(of_noise(sensor.noise, rate_hz)),
     )
 
 

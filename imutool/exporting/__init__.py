@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 
-Progress = Callable[[int, int, str], None]  # done, in all, what is being written
+from imutool.report import Report
 
 
-@dataclass(frozen=True)
-class ExportReport:
+class ExportReport(Report, frozen=True, tag="imutool.export/1"):
     """Exported files with their rows, the IMU's topic (EuRoC), and the topics left out."""
 
     output: Path
     format: str
-    imu: str | None = None
-    written: dict[str, int] = field(default_factory=dict)
-    left_out: list[str] = field(default_factory=list)
+    imu: str | None
+    written: dict[str, int]
+    left_out: list[str]

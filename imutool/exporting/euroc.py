@@ -15,7 +15,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.cleaning.truth import read_truth, truth_of
 from imutool.errors import LogError
-from imutool.exporting import ExportReport, Progress
+from imutool.exporting import ExportReport
 from imutool.exporting.log_parts import NotInPartsError, read_in_parts
 from imutool.exporting.sensor_yaml import imu_yaml
 from imutool.inertial.strapdown import velocity_follows
@@ -31,6 +31,7 @@ from imutool.mcap_io.topics import DERIVED_KEY, VELOCITY_KEY
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Noise
 from imutool.recording import Frames, Poses, Recording, Scalars, seconds, unit_quaternions
+from imutool.report import NamedProgress
 from imutool.units import SENSORS
 
 BLOCK_ROWS = 10_000
@@ -62,7 +63,7 @@ HOLDS = (  # paths in a folder that is written
 
 
 def write(
-    log: Path, out: Path, imu: str | None, sensor_noise: str | Path | None, overwrite: bool, tell: Progress
+    log: Path, out: Path, imu: str | None, sensor_noise: str | Path | None, overwrite: bool, tell: NamedProgress
 ) -> ExportReport:
     """Writes the folder `out`; the arguments are those of `imutool.export`.
 
@@ -85,7 +86,7 @@ def write(
     return ExportReport(out, "euroc", topic, writer.written, left_out)
 
 
-def _written(log: Log, topic: str, root: Path, whole: Recording | None, given: Noise | None, tell: Progress) -> _Asl:
+def _written(log: Log, topic: str, root: Path, whole: Recording | None, given: Noise | None, tell: NamedProgress) -> _Asl:
     """Writes a folder from a recording, or from the parts of one.
 
     Raises:
@@ -118,7 +119,7 @@ def _best_imu(log: Log) -> str:
 class _Asl:
     """Writes the parts of a `mav0` folder and counts their rows."""
 
-    def __init__(self, log: Log, topic: str, root: Path, files: ExitStack, tell: Progress) -> None:
+    def __init__(self, log: Log, topic: str, root: Path, files: ExitStack, tell: NamedProgress) -> None:
         self.root, self.tell, self._log, self._files = root, tell, log, files
         self._source = log.topics[topic].metadata.get(DERIVED_KEY)  # the topic from which the samples were computed
         self.written: dict[str, int] = {}

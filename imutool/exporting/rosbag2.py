@@ -9,10 +9,11 @@ import re
 from pathlib import Path
 
 from imutool.errors import ConfigError, LogError
-from imutool.exporting import ExportReport, Progress
+from imutool.exporting import ExportReport
 from imutool.file_location import identity
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.target import SIGNATURE, FolderTarget, writing
+from imutool.report import NamedProgress
 
 COPY_BYTES = 1 << 20
 VERSION = 5  # of metadata.yaml: the oldest with a list of files, so that Humble plays it, and every later one too
@@ -24,7 +25,7 @@ QOS_NUMBERS = {  # as rmw numbers them; names came with version 9
 }
 
 
-def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport:
+def write(log: Path, out: Path, overwrite: bool, tell: NamedProgress) -> ExportReport:
     """Writes the folder `out`; the arguments are those of `imutool.export`."""
     before = identity(log)
     with Log(log) as opened:
@@ -38,7 +39,7 @@ def write(log: Path, out: Path, overwrite: bool, tell: Progress) -> ExportReport
         if identity(log) != before:  # the index and the bytes are of two logs
             raise LogError("changed while it was copied", where=log, fix="Wait until it is complete")
         (folder / "metadata.yaml").write_text(text, encoding="utf-8", newline="\n")
-    return ExportReport(out, "rosbag2", None, counts)
+    return ExportReport(out, "rosbag2", None, counts, [])
 
 
 def _check_readable(log: Log) -> None:
@@ -58,7 +59,7 @@ def _check_readable(log: Log) -> None:
             raise LogError(what, where=log.path, expected="CDR messages of ROS 2", fix="Use `format=euroc`")
 
 
-def _copy(log: Path, copy: Path, tell: Progress) -> None:
+def _copy(log: Path, copy: Path, tell: NamedProgress) -> None:
     """Copies the log into a file of its own, reads it back and compares.
 
     Raises:

@@ -28,7 +28,7 @@ def write_tum(parts: Iterable[Poses], path: Path, overwrite: bool = False) -> No
             target.write(text.encode("ascii"))
 
 
-def write_trajectory(parts: Iterable[Poses], folder: Path, log: str, name: str, overwrite: bool) -> None:
+def write_trajectory(folder: Path, log: str, overwrite: bool, name: str, parts: Iterable[Poses]) -> None:
     """Write FOLDER/LOG_NAME.tum, as `write_tum`, and the folder."""
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,7 @@ from imutool.fleet.robots import FEWEST, Comparison, Outlier
 from imutool.fleet.task import Result, Settings
 from imutool.mcap_io.storage.target import Target
 from imutool.units import UNITS
-from imutool.viewing.html.drawing import prefix_ids, svg
+from imutool.viewing.html.drawing import figure_of, svg
 from imutool.viewing.html.page import AFTER, AXIS_COLORS, cards, document, text
 
 MAX_NAMED = 10  # robots with an effect
@@ -216,11 +216,11 @@ def _spread(statistics: Statistics) -> Iterator[str]:
         if len(values) > 1:
             rows = np.array(values)
             caption = f"Initial bias of the {signal} over {len(rows)} IMUs, by axis"
-            yield _figure(_axes(rows, f"{signal} bias ({UNITS[signal]})"), f"b{k}", caption)
+            yield figure_of(_axes(rows, f"{signal} bias ({UNITS[signal]})"), f"b{k}", text(caption))
     times = [(statistics.seconds, "seconds a log"), (statistics.speeds, "MB/s of one worker")]
-    yield _figure(_histograms(times, "times"), "t", "Time and speed by log")
+    yield figure_of(_histograms(times, "times"), "t", "Time and speed by log")
     if len(statistics.scores) > 1 and min(statistics.scores) < max(statistics.scores):
-        yield _figure(_histograms([(statistics.scores, "quality score")], "scores"), "q", "Quality")
+        yield figure_of(_histograms([(statistics.scores, "quality score")], "scores"), "q", "Quality")
 
 
 def _axes(rows: Float64[np.ndarray, "n 3"], label: str) -> str:
@@ -249,10 +249,6 @@ def _histogram(axes: Any, values: Float64[np.ndarray, " n"], label: str, color: 
     axes.set_axisbelow(True)
     axes.locator_params(axis="x", nbins=5)
     axes.locator_params(axis="y", nbins=4, integer=True)
-
-
-def _figure(drawn: str, prefix: str, caption: str) -> str:
-    return f"<figure>{prefix_ids(drawn, prefix)}<figcaption>{text(caption)}</figcaption></figure>"
 
 
 def _provenance(settings: Settings) -> Iterator[str]:

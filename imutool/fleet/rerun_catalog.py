@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from imutool.errors import ConfigError, not_installed
 from imutool.fleet.rerun_layers import APPLICATION, LAYERS, PROPERTIES, Layers
+from imutool.report import Report, Section
 
 if TYPE_CHECKING:
     from rerun.catalog import DatasetEntry
@@ -39,13 +40,30 @@ MEASURES = {
 }
 
 
-class Segment(NamedTuple):
-    """Row of the query for the worst logs: segment, address for a viewer, layers and properties."""
+class WorstLog(Section, frozen=True):
+    """Log of a catalog with the address that a viewer opens, its layers and properties."""
 
     name: str
     url: str
     layers: list[str]
     values: dict[str, float | str]
+
+
+class NotShown(Section, frozen=True):
+    """Log without a segment, and the reason."""
+
+    name: str
+    reason: str
+
+
+class CatalogReport(Report, frozen=True, tag="imutool.catalog/1"):
+    """Report of `imutool fleet view`: address, number of segments, and the worst logs."""
+
+    url: str
+    segments: int
+    by: str
+    worst: list[WorstLog]
+    not_shown: list[NotShown]
 
 
 def require_catalog() -> None:
@@ -90,7 +108,7 @@ class Catalog:
         """Address at which the server listens, as a browser names it."""
         return self._server.url().removeprefix("rerun+")
 
-    def worst(self, by: str | None, count: int) -> tuple[str, list[Segment]]:
+    def worst(self, by: str | None, count: int) -> tuple[str, list[WorstLog]]:
         """Measure and worst logs by it, from a query of the segments' table; a log without a value comes last.
 
         Without `by` the measure is the first of `MEASURES` that a log has.
@@ -115,10 +133,10 @@ class Catalog:
         rows = table.select(*names, *columns).sort(order, col("segment").sort()).limit(count).to_pylist()
         return by, [self._segment(row) for row in rows]
 
-    def _segment(self, row: dict[str, Any]) -> Segment:
+    def _segment(self, row: dict[str, Any]) -> WorstLog:
         name, layers_of = row.pop("segment"), row.pop("layers")
         values = {key: value for key, value in row.items() if value is not None}
-        return Segment(name, self.dataset.segment_url(name), [layer for layer in LAYERS if layer in layers_of], values)
+        return WorstLog(name, self.dataset.segment_url(name), [layer for layer in LAYERS if layer in layers_of], values)
 
     def _register_layout(self, cache: Path) -> None:
         from imutool.viewing.rerun.layout import fleet_blueprint

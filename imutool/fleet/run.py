@@ -24,11 +24,10 @@ from imutool.fleet.robots import Comparison, compare
 from imutool.fleet.sources import Found, find, with_simulations
 from imutool.fleet.targets import page_name, partial_files, refuse_own, remove_files, target_name
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task, failed
-from imutool.report import UNSET
+from imutool.report import UNSET, NamedProgress, silent
 
 COMPARED, TITLE = "fleet.json", b"<title>Fleet "
 MAX_LISTED = 1000  # of the results with a problem, in JSON
-Tell = Callable[[int, int, str], None]
 Wording = Callable[[str], str]
 
 
@@ -122,7 +121,7 @@ def run(
     recheck: bool = False,
     page: Location | None = None,
     json_to: Location | None = None,
-    tell: Tell = lambda done, total, words: None,
+    tell: NamedProgress = silent,
     wording: Wording = str,
 ) -> FleetReport:
     """Run a command on every log of `source`; write the results and fleet.parquet to `out`.

@@ -62,10 +62,9 @@ class Motion:
     def specific_force(self, r_b: Float[np.ndarray, "3"] | None = None, g_w: Float[np.ndarray, "3"] = G_W) -> Vectors:
         """Specific force at `r_b` in the body frame (m/s²): R_wb^T (a_w - g_w); at rest +g up."""
         force = self._rotation().apply(self.a_w - g_w, inverse=True)
-        return np.asarray(force if r_b is None else force + self._lever(r_b))
-
-    def _lever(self, r_b: Float[np.ndarray, "3"]) -> Vectors:
-        return np.stack(lever_acceleration(self.omega_b.T, self.alpha_b.T, (r_b, r_b, r_b)), axis=1)
+        if r_b is not None:
+            force = force + np.stack(lever_acceleration(self.omega_b.T, self.alpha_b.T, (r_b, r_b, r_b)), axis=1)
+        return np.asarray(force)
 
     def _rotation(self) -> Any:
         from scipy.spatial.transform import Rotation

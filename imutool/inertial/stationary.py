@@ -66,6 +66,9 @@ class StationarySettings(Settings, frozen=True, kw_only=True):
     gyro_trend_rad_s: Positive = 2e-3  # between the means of a window's halves, in addition to four deviations of their noise
 
 
+USUAL = StationarySettings()
+
+
 class Blocks(NamedTuple):
     """Block statistics of samples in blocks of `k`: 4 MB per hour at any rate."""
 
@@ -78,9 +81,9 @@ class Blocks(NamedTuple):
     late: Bool[np.ndarray, " m"]  # samples are missing inside or before it
 
 
-def block_statistics(batches: Iterable[Batch], period_s: float, settings: StationarySettings | None = None) -> Blocks:
+def block_statistics(batches: Iterable[Batch], period_s: float, settings: StationarySettings = USUAL) -> Blocks:
     """Block statistics of batches of samples; an incomplete last block is ignored."""
-    k = max(2, round((settings or StationarySettings()).block_s / period_s))
+    k = max(2, round(settings.block_s / period_s))
     parts = [_blocks_of(np.zeros(0, np.int64), np.zeros((0, 6)), k, 0, period_s)]
     t_left, u_left = np.zeros(0, np.int64), np.zeros((0, 6))
     before: int | None = None
@@ -103,7 +106,7 @@ def _blocks_of(t_ns: Int64[np.ndarray, " n"], u: Float64[np.ndarray, "n 6"], k: 
     return Blocks(k, period_s, t[:, 0].copy(), t[:, -1].copy(), np.asarray(cut.mean(axis=1)), cut.var(axis=1, ddof=1), inside)
 
 
-def rest_stretches(imu: Imu, settings: StationarySettings | None = None) -> list[tuple[int, int]]:
+def rest_stretches(imu: Imu, settings: StationarySettings = USUAL) -> list[tuple[int, int]]:
     """Rest stretches as ordered, disjoint index ranges `[start, end)`; none of too few samples."""
     if len(imu) < 2:
         return []
@@ -112,14 +115,13 @@ def rest_stretches(imu: Imu, settings: StationarySettings | None = None) -> list
     return [(first * blocks.k, last * blocks.k) for first, last in resting_blocks(blocks, settings)]
 
 
-def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -> list[tuple[int, int]]:
+def resting_blocks(blocks: Blocks, settings: StationarySettings = USUAL) -> list[tuple[int, int]]:
     """Rest stretches of at least `min_s` as ordered, disjoint ranges `[first, end)` of blocks.
 
     Window statistics: block means m_j and variances s_j^2 over k samples each; rest when
     std(m) <= max(1.3 sqrt(mean(s^2) / k), 2.5 floor) for the gyro, and all figures are within their caps. The margin of
     1.3 is that of equally noisy axes (`_white_margin`).
     """
-    settings = settings or StationarySettings()
     k, period_s, count = blocks.k, blocks.period_s, len(blocks.late)
     width = max(4, round(settings.window_s / (k * period_s)))
     if count < width:
@@ -159,10 +161,9 @@ class OnlineRestDetector:
     a window; a longer or shorter block changes the lengths in proportion.
     """
 
-    def __init__(self, settings: StationarySettings | None = None) -> None:
-        self.settings = settings or StationarySettings()
-        self.parts = max(2, round(0.5 * self.settings.window_s / self.settings.block_s))
-        self.needed = max(1, round((self.settings.min_s - self.settings.window_s) / (0.5 * self.settings.window_s)) + 1)
+    def __init__(self) -> None:
+        self.parts = max(2, round(0.5 * USUAL.window_s / USUAL.block_s))
+        self.needed = max(1, round((USUAL.min_s - USUAL.window_s) / (0.5 * USUAL.window_s)) + 1)
         self.blocks_needed = self.needed + 1
         self._last: tuple[Float64[np.ndarray, "parts 6"], Float64[np.ndarray, "parts 6"], int] | None = None
         self._calmest: list[float] = []
@@ -188,7 +189,7 @@ class OnlineRestDetector:
         return self._resting >= self.needed
 
     def _window(self, mean: Float64[np.ndarray, "w 6"], var: Float64[np.ndarray, "w 6"], k: int) -> bool:
-        s = self.settings
+        s = USUAL
         whole = mean.sum(axis=0) / len(mean)
         away, centre = mean - whole, whole[:3]
         squares, noises = np.einsum("wi,wi->i", away, away).tolist(), var.sum(axis=0).tolist()

@@ -33,7 +33,8 @@ class Log:
 
     Memory is bounded by the largest chunk; a chunk of more than `max_chunk` bytes is refused. The path may also be an open
     `Source`. Times in a method's arguments select by log time, both ends included. The first damage is an error;
-    `recovery.recovered_log.RecoveredLog` reads the intact part of a damaged log. Threads open a log each.
+    `recovery.recovered_log.RecoveredLog` reads the intact part of a damaged log. Threads open a log each. A log without
+    `reads_topics` is copied or checked as it is: a topic may have two types.
 
     Raises:
         ConfigError: the file cannot be opened.
@@ -42,8 +43,9 @@ class Log:
 
     index: LogIndex
 
-    def __init__(self, path: str | Location | Source, *, max_chunk: int | None = None) -> None:
+    def __init__(self, path: str | Location | Source, *, max_chunk: int | None = None, reads_topics: bool = True) -> None:
         keep_buffers()
+        self._reads_topics = reads_topics
         self.max_chunk = records.MAX_CHUNK if max_chunk is None else max_chunk
         self._source = path if isinstance(path, Source) else Source(location(path))
         self._owns_source, self.path = True, self._source.path
@@ -62,6 +64,8 @@ class Log:
 
     def _read_topics(self) -> None:
         """Reads the topics from the index; IMUs of other types may need the first messages."""
+        if not self._reads_topics:
+            return
         self.topics = MappingProxyType(topics_of(self.index))
         self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, self.firsts, self.rows)})
 

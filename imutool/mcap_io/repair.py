@@ -34,6 +34,7 @@ from imutool.mcap_io.storage.source import BLOCK_BYTES, Source, crc_of
 from imutool.mcap_io.storage.target import Target, temporary
 from imutool.mcap_io.verify import verify, verify_index
 from imutool.processes.system import collector_paused
+from imutool.report import Progress, silent
 
 RECORD = "imutool_repair"  # name of the metadata record
 DAMAGED = "imutool/damaged"  # attachments below this name hold damaged bytes as they were found
@@ -65,7 +66,7 @@ def repair(
     damaged: str = "drop",
     overwrite: bool = False,
     max_chunk: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
 ) -> RepairReport:
     """Writes the intact part of `source` to `target`, in order of log time, with all indexes.
 
@@ -82,26 +83,19 @@ def repair(
         raise ConfigError(f"unknown treatment of damaged bytes {damaged!r}", where="damaged", expected="drop or keep")
     if same_location(source, target):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
-    tell = progress or (lambda done, total: None)
-    with collector_paused(), _LogWithoutTopics(source, max_chunk=max_chunk) as log:
+    with collector_paused(), RecoveredLog(source, max_chunk=max_chunk, reads_topics=False) as log:
         try:
-            return _copy_intact(log, target, overwrite, tell) or _repair(log, target, damaged, overwrite, tell)
+            return _copy_intact(log, target, overwrite, progress) or _repair(log, target, damaged, overwrite, progress)
         except _ContradictionError:
             log.read_by_records()
-            return _repair(log, target, damaged, overwrite, tell)
-
-
-class _LogWithoutTopics(RecoveredLog):
-    """Damaged log whose topics nobody reads: they may have two types, and are saved as they are."""
-
-    def _read_topics(self) -> None: ...
+            return _repair(log, target, damaged, overwrite, progress)
 
 
 class _ContradictionError(Exception):
     """The contents of a log are not as its index says."""
 
 
-def _copy_intact(log: RecoveredLog, target: Location, overwrite: bool, tell: Callable[[int, int], None]) -> RepairReport | None:
+def _copy_intact(log: RecoveredLog, target: Location, overwrite: bool, tell: Progress) -> RepairReport | None:
     """Copies a log whose indexes and CRCs are all there and right; None for any other.
 
     Frames of lz4 may lack their end mark, without which other readers refuse them: such a log is none.
@@ -134,9 +128,7 @@ def _report(log: RecoveredLog, counts: Mapping[int, int], chunks: int, kept: int
     return RepairReport(log.losses, saved, chunks, kept, log.index.source.size, target_bytes)
 
 
-def _repair(
-    log: RecoveredLog, target: Location, damaged: str, overwrite: bool, tell: Callable[[int, int], None]
-) -> RepairReport:
+def _repair(log: RecoveredLog, target: Location, damaged: str, overwrite: bool, tell: Progress) -> RepairReport:
     index, losses, size = log.index, log.losses, log.index.source.size
     compression = next((b.compression for b in index.blocks if b.compression), "zstd")
     with LogWriter(target, compression=compression, overwrite=overwrite, header=index.header_bytes) as out:

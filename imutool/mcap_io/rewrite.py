@@ -24,6 +24,7 @@ from mcap.records import Metadata, MetadataIndex
 
 from imutool.errors import ConfigError, LogError
 from imutool.file_location import Location, identity, same_location
+from imutool.mcap_io import Verified
 from imutool.mcap_io.blocks import Attachment, MessageBlock, MessageIndexes, RecordSpan, read_message_indexes
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.messages import Messages
@@ -33,9 +34,10 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.added_topics import DerivedStream, DerivedTopics, check_new_topics, define
 from imutool.mcap_io.passthrough.chunk_check import check_chunk, parts_of
 from imutool.mcap_io.storage.target import PassThrough
-from imutool.mcap_io.verify import Verified, check_data_crc, check_mode, stated_crc, verify
+from imutool.mcap_io.verify import check_data_crc, check_mode, stated_crc, verify
 from imutool.mcap_io.write import CHUNK_BYTES
 from imutool.processes.system import give
+from imutool.report import Progress, silent
 
 REPAIR = "imutool repair sets them right"
 RUN_BYTES = 16 << 20  # of the source are copied at once; progress is reported between
@@ -64,7 +66,7 @@ def rewrite(
     overwrite: bool = False,
     check: str = "imu",
     own_encoding: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
 ) -> RewriteReport:
     """Writes all of `source` to `target`, with derived topics and metadata records.
 
@@ -98,7 +100,7 @@ def rewrite(
         packing = next((block.compression for block in log.index.blocks if block.compression is not None), "none")
         crc, header, replace = bool(stated_crc(log.index)), log.index.header_bytes, overwrite or target is None
         with LogWriter(place, compression=packing, overwrite=replace, header=header, data_crc=crc) as out:
-            report = _Rewrite(log, out, derived, check, own_encoding, progress or (lambda *_: None)).run(metadata)
+            report = _Rewrite(log, out, derived, check, own_encoding, progress).run(metadata)
             if target is None and isinstance(path, Path) and isinstance(out.target.temporary, Path):
                 _copy_permissions(path, out.target.temporary)
             if identity(path) != log.index.source.identity:
@@ -123,7 +125,7 @@ class _Rewrite:
         derived: Sequence[DerivedTopics],
         check: str,
         own: bool,
-        tell: Callable[[int, int], None],
+        tell: Progress,
     ) -> None:
         self.log, self.index, self.source, self.out = log, log.index, log.index.source, out
         self.check, self.tell = check, tell

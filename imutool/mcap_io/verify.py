@@ -7,8 +7,7 @@ its chunk, and the statistics are the sums of these. The contents of a chunk are
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
-from typing import NamedTuple
+from collections.abc import Collection, Mapping
 
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, DataEnd, MetadataIndex, SummaryOffset
@@ -22,16 +21,9 @@ from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.chunk_check import check_chunk
 from imutool.mcap_io.storage.source import crc_of
+from imutool.report import Progress, silent
 
 MODES = ("all", "imu", "none")
-
-
-class Verified(NamedTuple):
-    """Checks made on a log: the mode, and how many of its chunks were unpacked."""
-
-    mode: str
-    chunks_checked: int
-    chunks: int
 
 
 def check_mode(mode: str) -> None:
@@ -50,7 +42,7 @@ def verify(
     *,
     unpacked: Collection[int] | None = None,
     max_chunk: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
 ) -> int:
     """Checks a log that should hold `counts` messages per channel id.
 
@@ -62,14 +54,8 @@ def verify(
     Raises:
         LogError: the log contradicts its own indexes, statistics or CRCs.
     """
-    with _LogWithoutTopics(path, max_chunk=max_chunk) as log, log.named():
+    with Log(path, max_chunk=max_chunk, reads_topics=False) as log, log.named():
         return verify_index(log.index, counts, unpacked=unpacked, progress=progress)
-
-
-class _LogWithoutTopics(Log):
-    """Log whose topics nobody reads."""
-
-    def _read_topics(self) -> None: ...
 
 
 def verify_index(
@@ -78,7 +64,7 @@ def verify_index(
     *,
     unpacked: Collection[int] | None = None,
     proven: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
 ) -> int:
     """Checks an open log as `verify` does; returns how many chunks were unpacked.
 
@@ -92,8 +78,7 @@ def verify_index(
         whole = unpacked is None or block.offset in unpacked
         sums.add(index, block, whole=whole)
         done += whole
-        if progress:
-            progress(block.end, index.source.size)
+        progress(block.end, index.source.size)
     sums.compare(index, counts)
     _check_summary(index, complete=proven)
     if unpacked is None:

@@ -9,6 +9,9 @@ model nor the truth explains (a delay, a wrong scale) is in it too, which is why
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import torch
 
@@ -61,7 +64,7 @@ def curves(imu: Imu, truth: Poses) -> tuple[Curve, Curve]:
     while 2 * n < len(imu):
         hop = max(1, n // OVERLAP)
         first = _starts(len(imu), n, hop, broken)
-        gyro, accel = (_spread(imu, t, R_wb, v_w, first, n, sensor) for sensor in ("gyro", "accel"))
+        gyro, accel = (_spread(partial(_error, imu, t, R_wb, v_w, n, sensor), first, n) for sensor in ("gyro", "accel"))
         if gyro is None or accel is None:
             break
         found[0].append(gyro)
@@ -89,19 +92,13 @@ def _starts(count: int, n: int, hop: int, broken: Int64[np.ndarray, " n"]) -> In
 
 
 def _spread(
-    imu: Imu,
-    t: Float64[np.ndarray, " n"],
-    R_wb: torch.Tensor,
-    v_w: Rows,
-    first: Int64[np.ndarray, " m"],
-    n: int,
-    sensor: str,
+    error: Callable[..., tuple[Rows, Bool[np.ndarray, " m"]]], first: Int64[np.ndarray, " m"], n: int
 ) -> Float64[np.ndarray, "3"] | None:
-    """Allan deviation of one sensor's error at one window length; None where too few windows can show it."""
+    """Allan deviation of the error over windows of n steps; None where too few of them can show it."""
     if len(first) <= MIN_WINDOWS:  # too few pairs of neighbours, and the longest windows take the most memory
         return None
     at_once = max(1, MAX_SAMPLES // n)
-    parts = [_error(imu, t, R_wb, v_w, first[k : k + at_once], n, sensor) for k in range(0, len(first), at_once)]
+    parts = [error(first[k : k + at_once]) for k in range(0, len(first), at_once)]
     y, shown = (np.concatenate(column) for column in zip(*parts, strict=True))
     first, y = first[shown], y[shown]
     after = np.searchsorted(first, first + n)  # the window that begins where this one ends
@@ -112,7 +109,7 @@ def _spread(
 
 
 def _error(
-    imu: Imu, t: Float64[np.ndarray, " n"], R_wb: torch.Tensor, v_w: Rows, first: Int64[np.ndarray, " m"], n: int, sensor: str
+    imu: Imu, t: Float64[np.ndarray, " n"], R_wb: torch.Tensor, v_w: Rows, n: int, sensor: str, first: Int64[np.ndarray, " m"]
 ) -> tuple[Float64[np.ndarray, "m 3"], Bool[np.ndarray, " m"]]:
     """Mean error of the sensor over each window, in the body's axes, and whether the window can show it."""
     index = first[:, None] + np.arange(n + 1)

@@ -156,7 +156,6 @@ def read(path: Path) -> PhysicsFile:
         ConfigError: no such file, no TOML, an unknown or missing key, a wrong type, a number that is not finite.
     """
     values = toml(path, "physics")
-    _refuse_infinite(values, path)
     file = build(PhysicsFile, values, where=path)
     for k, curve in enumerate(file.unknown):
         x = np.array(curve.x)
@@ -217,18 +216,6 @@ def _key(text: str) -> str:
 
 def _row(values: Sequence[float]) -> str:
     return f"[{', '.join(repr(float(value)) for value in values)}]"
-
-
-def _refuse_infinite(value: Any, where: Path, place: str = "") -> None:
-    """Refuse numbers that are not finite, and name their place."""
-    if isinstance(value, float) and not np.isfinite(value):
-        raise ConfigError(f"{place} is {value}", where=where, expected="a finite number")
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            _refuse_infinite(inner, where, f"{place}.{key}" if place else key)
-    elif isinstance(value, list):
-        for k, inner in enumerate(value):
-            _refuse_infinite(inner, where, f"{place}[{k}]")
 
 
 # ── effects by name ──

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.noise import datasheet
 from imutool.recording import interpolate
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.effect import Acting, Effect, Parameter, Stage, Theta
 from imutool.sensor.effects.temperature import NO_CHANNEL
 from imutool.sensor.samples import SensorSamples
 from imutool.units import AXES, UNITS, Sensor
@@ -150,6 +150,16 @@ def _channel(samples: SensorSamples, name: str) -> Float64[np.ndarray, " n"]:
         expected = f"one of the log's channels: {listed}"
         raise DataError(f"no channel {name}", where="physics", expected=expected, fix=NO_CHANNEL)
     return samples.channels[name]
+
+
+class SimulatedSensor(NamedTuple):
+    """Sensor to simulate: effects, the stamp from which they count time, noise, rate and seed."""
+
+    acting: Acting
+    start_ns: int | None
+    noise: datasheet.Noise
+    rate_hz: float | None  # by default that of the log
+    seed: int
 
 
 def additive_noise(noise: datasheet.Noise, rate_hz: float, seed: int) -> Effect:

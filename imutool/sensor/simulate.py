@@ -29,11 +29,12 @@ from imutool.mcap_io.write import write
 from imutool.noise import datasheet as noises
 from imutool.recording import Imu, Poses, Recording, unit_quaternions
 from imutool.recording.columns import median
+from imutool.report import NamedProgress, silent
 from imutool.sensor import physics_file
 from imutool.sensor.channels import channels_at, needs_channels, with_channels
 from imutool.sensor.effect import Acting, simulate_stretches
 from imutool.sensor.physics_file import PhysicsFile
-from imutool.sensor.physics_file_terms import additive_noise
+from imutool.sensor.physics_file_terms import SimulatedSensor, additive_noise
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.trajectory import SmoothMotion, smooth_motion
 
@@ -45,8 +46,6 @@ MAX_M_S2 = 100.0  # median acceleration; ten times gravity for half of the time 
 MOTION_HZ = 400.0  # of the motion's clock, at least: filters and shifts act there before samples are taken
 MOTION_TOPIC = "/motion/pose"  # the exact motion of the samples; the truth that it was smoothed from is copied
 TRUTH_TOPIC = "/ground_truth/pose"
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +81,7 @@ class Simulation:
         }
 
 
-# from a log, its pose topic, effects, the stamp from which they count, noise, rate and seed
-Along = Callable[[Path, str | None, Acting, int | None, noises.Noise, float | None, int], Simulation]
+Along = Callable[[Path, str | None, SimulatedSensor], Simulation]  # from a log and its pose topic
 
 
 def simulate(
@@ -96,7 +94,7 @@ def simulate(
     seed: int = 0,
     truth: str | None = None,
     overwrite: bool = False,
-    progress: Progress | None = None,
+    progress: NamedProgress = silent,
     along: Along | None = None,
 ) -> Simulation:
     """Simulate an IMU along the poses of a log and write the log `out`; see `simulated`.
@@ -109,19 +107,18 @@ def simulate(
         LogError: the log has no poses, or is damaged.
         DataError: less than 2 s of trusted motion, an effect without its channel, or poses that the log's IMU contradicts.
     """
-    report = progress or (lambda done, total, word: None)
     file = PhysicsFile() if physics is None else physics_file.read(physics)
-    acting = file.acting(where=physics or "physics")
-    sheet = noises.read(noise)
+    acting, sheet = file.acting(where=physics or "physics"), noises.read(noise)
+    sensor = SimulatedSensor(acting, file.start_ns, sheet, rate_hz, seed)
     if same_location(out, trajectory):
         raise ConfigError("is the trajectory itself", where=out, expected="another OUT")
     _check(rate_hz, seed)
-    report(0, 2, "simulating")
+    progress(0, 2, "simulating")
     try:
-        simulation = (along or _along_poses)(trajectory, truth, acting, file.start_ns, sheet, rate_hz, seed)
+        simulation = (along or _along_poses)(trajectory, truth, sensor)
     except ImutoolError as error:
         raise error.at(trajectory) from error
-    report(1, 2, "writing")
+    progress(1, 2, "writing")
     settings = {
         "command": "simulate",
         "trajectory": trajectory.name,
@@ -132,7 +129,7 @@ def simulate(
     texts = {key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False) for key, value in settings.items()}
     recording = replace(simulation.recording, name=out.stem, metadata={**simulation.recording.metadata, "imutool": texts})
     write(recording, out, overwrite=overwrite)
-    report(2, 2, "")
+    progress(2, 2, "")
     others = (
         f"{entry.name} of {entry.column} is no effect of an IMU, and not simulated" for entry in file.effect if entry.column
     )
@@ -140,13 +137,11 @@ def simulate(
     return replace(simulation, recording=recording, settings=settings | {"output": str(out)}, remarks=remarks)
 
 
-def _along_poses(
-    path: Path, truth: str | None, acting: Acting, start_ns: int | None, noise: noises.Noise, rate_hz: float | None, seed: int
-) -> Simulation:
-    source = _source(path, truth, channels=needs_channels(acting))
+def _along_poses(path: Path, truth: str | None, sensor: SimulatedSensor) -> Simulation:
+    source = _source(path, truth, channels=needs_channels(sensor.acting))
     check_poses(source)
-    own_hz = 1.0 / source.imu.period_s if len(source.imu) > 1 else RATE_HZ
-    found = simulated(source, acting, noise, _rounded(own_hz) if rate_hz is None else rate_hz, seed, start_ns=start_ns)
+    rate_hz = sensor.rate_hz or _rounded(1.0 / source.imu.period_s if len(source.imu) > 1 else RATE_HZ)
+    found = simulated(source, sensor.acting, sensor.noise, rate_hz, sensor.seed, start_ns=sensor.start_ns)
     settings = {"truth": next(iter(source.truths)), "imu": None, **found.settings}
     return replace(found, recording=replace(found.recording, metadata=source.metadata), settings=settings)
 

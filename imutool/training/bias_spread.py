@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from msgspec import to_builtins
 from scipy.special import chdtri
 from torch import Tensor
 
 from imutool.array_types import Float, Float64
-from imutool.bias.model import COLUMNS, Vector6
+from imutool.bias.model import COLUMNS, Session, Vector6
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.networks.threads import of_each
 from imutool.bias_start.bias_at_rest import rest_differences
@@ -46,20 +46,6 @@ ERROR_SHARES = np.geomspace(1e-6, 2.0, 30)  # variance of a window's own noise, 
 BY_CHANCE = 0.01  # probability that logs seem to show a shift of the bias at rest where there is none
 
 
-@dataclass(frozen=True)
-class Session:
-    """Session of one switching-on: stamps of its logs, and the rest bias of its next log."""
-
-    start_ns: int
-    end_ns: int
-    mean: Float64[np.ndarray, "6"]
-    std: Float64[np.ndarray, "6"]
-
-    def card(self) -> dict[str, Any]:
-        """Entry of a model card."""
-        return {"start_ns": self.start_ns, "end_ns": self.end_ns, "mean": self.mean.tolist(), "std": self.std.tolist()}
-
-
 class TurnOn(NamedTuple):
     """Rest bias of the next session, and the sessions known.
 
@@ -73,7 +59,7 @@ class TurnOn(NamedTuple):
 
     def card(self) -> dict[str, Any]:
         """Entries of a model card."""
-        return {"sessions": [session.card() for session in self.sessions], "turn_on_least_std": self.min_std.tolist()}
+        return {"sessions": to_builtins(self.sessions), "turn_on_least_std": self.min_std.tolist()}
 
 
 def store_statistics(
@@ -130,8 +116,8 @@ def turn_on_prior(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[
         Session(
             min(spans_ns[log][0] for log in group),
             max(spans_ns[log][1] for log in group),
-            of_group,
-            np.sqrt(within * (1 + 1 / len(group))),
+            tuple(of_group.tolist()),
+            tuple(np.sqrt(within * (1 + 1 / len(group))).tolist()),
         )
         for group, of_group in zip(groups, means, strict=True)
         if broken <= len(rest) - len(groups)

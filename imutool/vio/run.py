@@ -8,7 +8,7 @@ the samples differ. The estimate starts in the true state and is scored where th
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -26,6 +26,7 @@ from imutool.inertial.strapdown import StartPose, with_velocity
 from imutool.log_info.convention_report import check_conventions
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
+from imutool.report import NamedProgress, Progress, silent
 from imutool.vio import camera, smoother
 from imutool.vio.camera import Frame
 from imutool.vio.smoother import Positive, SmootherSettings
@@ -35,7 +36,6 @@ ON, OFF = "on", "off"
 ABSOLUTE = ("aoe_deg", "ape_m", "aoe_aligned_deg", "ape_aligned_m", "velocity_rmse_m_s")
 RELATIVE = ("roe_deg", "rpe_m")
 FIGURES = ("samples", "duration_s", *ABSOLUTE, *RELATIVE, "gyro_bias_end", "accel_bias_end")
-Tell = Callable[[int, int, str], None]
 
 
 class VioSettings(config.Settings, frozen=True, kw_only=True):
@@ -70,7 +70,7 @@ def vio(
     imu: str | None = None,
     bias_states: Sequence[bool] = (True, False),
     settings: VioSettings | None = None,
-    progress: Tell | None = None,
+    progress: NamedProgress = silent,
 ) -> list[dict[str, Any]]:
     """One result for the raw samples and each model, with bias states and without.
 
@@ -152,7 +152,7 @@ def score(
     settings: VioSettings,
     *,
     bias_states: bool,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Figures of one run, or why it failed.
 
@@ -200,10 +200,8 @@ def _keyframes(t_ns: Int64[np.ndarray, " n"], rate_hz: float) -> Int64[np.ndarra
     return np.unique(np.where(wanted - t_ns[after - 1] <= t_ns[after] - wanted, after - 1, after))
 
 
-def _within(progress: Tell | None, done: int, total: int, word: str) -> Callable[[int, int], None] | None:
+def _within(progress: NamedProgress, done: int, total: int, word: str) -> Progress:
     """Progress of one run as a part of all."""
-    if progress is None:
-        return None
     progress(1000 * done, 1000 * total, word)
     return lambda k, n: progress(1000 * done + 1000 * k // n, 1000 * total, "")
 

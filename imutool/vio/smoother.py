@@ -12,7 +12,7 @@ given six further steps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -24,6 +24,7 @@ from imutool.array_types import Float64, Int64
 from imutool.errors import NumericsError, required
 from imutool.inertial.strapdown import StartPose
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, seconds
+from imutool.report import Progress, silent
 from imutool.vio.camera import EUROC, Frame
 
 Vectors = Float64[np.ndarray, "n 3"]
@@ -86,7 +87,7 @@ def estimate(
     *,
     pixel_std: float,
     bias_states: bool,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
 ) -> Estimate:
     """The trajectory at some samples of the IMU (`keyframes`, their rows).
 
@@ -113,8 +114,7 @@ def estimate(
         except RuntimeError as error:  # all that GTSAM throws
             raise _diverged(float(t_s[k]), _reason(error)) from error
         _check(rows[-1], float(t_s[k]), settings.fastest_m_s)
-        if progress is not None:
-            progress(k + 1, len(frames))
+        progress(k + 1, len(frames))
     table = np.array(rows)
     q_wb_wxyz = table[:, 3:7] / np.linalg.norm(table[:, 3:7], axis=1, keepdims=True)
     return Estimate(Poses(imu.t_ns[keyframes], table[:, :3], q_wb_wxyz, table[:, 7:10]), table[:, 10:])

@@ -41,7 +41,7 @@ from sensor_tables import (
     values_table,
 )
 
-from imutool.conversion.run import convert
+from imutool.api.logs import convert
 from imutool.diagnosis.diagnose import EVERY_UNIT, candidates_for, effect_sizes
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.noise_estimate import whitened

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from imutool.api.logs import convert
 from imutool.bias.model_file import find_model, header_of, library, load, shared_model, shipped_for
 from imutool.bias_start.correction import OnlineDebiaser
-from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.errors import ModelError
 from imutool.evaluation import evaluate

@@ -16,14 +16,14 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from imutool import registry
+from imutool.api.logs import convert
 from imutool.api.models import debias as debias_log
 from imutool.bias.model_file import shipped_for
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD
 from imutool.conversion import correction_rounds
-from imutool.conversion.common_setup import fitted_to, shared
 from imutool.conversion.corrections import RECORD, Corrections
 from imutool.conversion.message_writer import write_log
-from imutool.conversion.run import convert
+from imutool.conversion.shared_corrections import fitted_to, shared
 from imutool.converters import fetch
 from imutool.errors import DataError, LogError
 from imutool.evaluation import evaluate

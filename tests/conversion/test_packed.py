@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import zstandard
 
-from imutool.conversion.run import convert
+from imutool.api.logs import convert
 from imutool.conversion.workers import ConvertReport
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.read import read

@@ -10,8 +10,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from imutool.api.logs import convert
 from imutool.cleaning import raw_batches
-from imutool.conversion.run import convert
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read

@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
-from imutool.conversion.run import convert
+from imutool.api.logs import convert
 from imutool.conversion.workers import ConvertReport
 from imutool.errors import ConfigError, LogError
 from imutool.log_info.inspection import inspect

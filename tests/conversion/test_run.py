@@ -20,7 +20,7 @@ from support.tables import write_csv
 
 import imutool as imutool_api
 from imutool import registry
-from imutool.conversion.run import convert
+from imutool.api.logs import convert
 from imutool.conversion.workers import ConvertReport
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.log import Log
@@ -64,7 +64,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def test_one_sequence_goes_to_the_file_named(source, tmp_path):
     report = convert(source / "a", tmp_path / "new" / "log.mcap")
-    assert report == ConvertReport([tmp_path / "new" / "log.mcap"], [])
+    assert report == ConvertReport([tmp_path / "new" / "log.mcap"], [], [], [])
     assert read(report.written[0]) == next(iter(registry.load("imutool.converters", "euroc").read(source / "a")))
 
 

@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from imutool.conversion.run import convert as convert_logs
+from imutool.api.logs import convert as convert_logs
 from imutool.converters import mcap_log
 from imutool.errors import DataError
 from imutool.mcap_io.codec import records

@@ -9,7 +9,7 @@ import pytest
 from pyulog.ulog2csv import convert_ulog2csv
 from support.flight_logs import ulog_flight
 
-from imutool.conversion.run import convert
+from imutool.api.logs import convert
 from imutool.converters import px4_csv, table, ulog
 from imutool.errors import DataError
 from imutool.mcap_io.log import Log

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from support.flight_logs import write_dataflash
 from support.tables import write_csv
 
-from imutool.conversion.run import convert
+from imutool.api.logs import convert
 from imutool.converters import sensor_tables, table
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.read import read

@@ -10,7 +10,7 @@ import scipy.io
 from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
-from imutool.conversion.run import convert
+from imutool.api.logs import convert
 from imutool.converters import table
 from imutool.errors import ConfigError
 from imutool.mcap_io.read import read

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from support import planted
 
 from imutool import diagnosis_output
+from imutool.diagnosis.compared_logs import ComparedLogs
 from imutool.diagnosis.settings import DiagnoseSettings, SearchSettings
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
@@ -53,7 +54,7 @@ def log(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
 @pytest.mark.parametrize("first", [None, OTHER])
 def test_the_imus_of_a_log_are_compared_with_each_other(log: Path, first: str | None, tmp_path: Path) -> None:
     """Its page shows the IMU whose findings they are: it was left out where none was asked for."""
-    d, left_out = diagnosis_output.diagnose([log], folder=tmp_path / "out", imu=first, settings=BRIEFLY)
+    d, left_out = diagnosis_output.diagnose(ComparedLogs([log], imu=first, settings=BRIEFLY), tmp_path / "out")
     assert left_out == []
     pages = [page.read_text(encoding="utf-8") for page in (tmp_path / "out").glob(diagnosis_output.LOG)]
     assert [(first or FIRST) in page for page in pages] == [True] * bool(np.isfinite(d.bias).all())  # next to a reference

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.localization import locate, locate_findings, locate_residual
+from imutool.diagnosis.localization import Misfit, locate, locate_findings, locate_residual
 from imutool.diagnosis.result import Located
 from imutool.sensor.samples import IdealMotion
 
@@ -33,20 +33,20 @@ def acting(column: int, rows: np.ndarray, size: float = 5.0) -> np.ndarray:
 
 
 def test_no_misfit_lies_nowhere() -> None:
-    assert locate(T, NOTHING, NOISE, {}, {}) == []
+    assert locate(Misfit(T, NOTHING, NOISE), {}, {}) == []
 
 
 def test_a_misfit_far_below_the_noise_lies_nowhere() -> None:
-    assert locate(T, acting(4, T >= 0.0, 0.05), NOISE, {}, {}) == []
+    assert locate(Misfit(T, acting(4, T >= 0.0, 0.05), NOISE), {}, {}) == []
 
 
 def test_a_misfit_that_is_certain_and_shows_in_no_second_lies_everywhere() -> None:
     weak = acting(4, T >= 0.0, 0.15)
-    (one,) = locate(T, weak, NOISE, {}, {"accel": 1e-4}, certain=["accel"])
+    (one,) = locate(Misfit(T, weak, NOISE), {}, {"accel": 1e-4}, certain=["accel"])
     assert (one.signal, one.axes, one.extent, one.share) == ("accel", ("y",), "everywhere", 1.0)
     assert one.intervals_s == ((0.0, DURATION_S),)
     assert one.p_value == 1e-4
-    assert locate(T, weak, NOISE, {}, {"accel": 1e-4}) == []
+    assert locate(Misfit(T, weak, NOISE), {}, {"accel": 1e-4}) == []
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def located_residual(residual: np.ndarray, rate_hz: float) -> list[Located]:
 
 @pytest.mark.parametrize("column", range(6))
 def test_axis_and_seconds_are_those_in_which_it_acts(column: int) -> None:
-    (one,) = locate(T, acting(column, (T >= 12.0) & (T < 19.0)), NOISE, {}, {"gyro": 1e-9, "accel": 1e-7})
+    (one,) = locate(Misfit(T, acting(column, (T >= 12.0) & (T < 19.0)), NOISE), {}, {"gyro": 1e-9, "accel": 1e-7})
     assert one.signal == ("gyro" if column < 3 else "accel")
     assert one.axes == ("xyz"[column % 3],)
     assert one.intervals_s == ((12.0, 19.0),)
@@ -86,36 +86,36 @@ def test_what_sets_in_is_there_from_then_on_also_before_the_middle_of_a_log(begi
     """The median took off what had set in: a scale from 12.6 s on was always there, and one from 27.3 s on from 27 s on."""
     misfit = NOTHING + 0.1  # the best constant is of both parts
     misfit[:, 4] += np.where(begins_s > T, 0.0, 0.1 * (9.81 + np.sin(T)))
-    (one,) = locate(T, misfit, NOISE, {"time": ("s", T)}, {})
+    (one,) = locate(Misfit(T, misfit, NOISE), {"time": ("s", T)}, {})
     assert (one.axes, one.regime) == (("y",), words)
     assert np.array(one.intervals_s) == pytest.approx(np.array([[begins_s, DURATION_S]]))
     step = NOTHING.copy()
     step[:, 1] = np.where(begins_s > T, 0.0, 0.1)  # the bias is that of the longer part
-    (one,) = locate(T, step, NOISE, {"time": ("s", T)}, {})
+    (one,) = locate(Misfit(T, step, NOISE), {"time": ("s", T)}, {})
     ends = (begins_s, DURATION_S) if begins_s > DURATION_S / 2.0 else (0.0, begins_s)
     assert np.array(one.intervals_s) == pytest.approx(np.array([ends]), abs=0.02)
 
 
 def test_intervals_are_on_the_clock_that_is_given() -> None:
-    (one,) = locate(T + 5.0, acting(4, (T >= 12.0) & (T < 19.0)), NOISE, {}, {})
+    (one,) = locate(Misfit(T + 5.0, acting(4, (T >= 12.0) & (T < 19.0)), NOISE), {}, {})
     assert one.intervals_s == ((17.0, 24.0),)
 
 
 def test_stretches_far_apart_stay_apart_and_close_ones_join() -> None:
     rows = ((T >= 5.0) & (T < 8.0)) | ((T >= 20.0) & (T < 24.0)) | ((T >= 30.0) & (T < 40.0))
-    (one,) = locate(T, acting(3, rows), NOISE, {}, {})
+    (one,) = locate(Misfit(T, acting(3, rows), NOISE), {}, {})
     assert one.intervals_s == ((5.0, 8.0), (20.0, 24.0), (30.0, 40.0))
 
 
 def test_an_axis_that_is_only_touched_is_not_named() -> None:
     rows = (T >= 5.0) & (T < 15.0)
-    (one,) = locate(T, acting(3, rows, 20.0) + acting(4, rows, 1.0) + acting(5, rows, 15.0), NOISE, {}, {})
+    (one,) = locate(Misfit(T, acting(3, rows, 20.0) + acting(4, rows, 1.0) + acting(5, rows, 15.0), NOISE), {}, {})
     assert one.axes == ("x", "z")
 
 
 def test_both_signals_are_told_the_surer_first() -> None:
     rows = (T >= 5.0) & (T < 15.0)
-    found = locate(T, acting(0, rows) + acting(5, rows), NOISE, {}, {"gyro": 1e-3, "accel": 1e-8})
+    found = locate(Misfit(T, acting(0, rows) + acting(5, rows), NOISE), {}, {"gyro": 1e-3, "accel": 1e-8})
     assert [(one.signal, one.axes) for one in found] == [("accel", ("z",)), ("gyro", ("x",))]
 
 
@@ -126,7 +126,7 @@ def test_the_regime_is_the_variable_with_its_threshold(word: str, seed: int) -> 
     at = float(np.quantile(rate, 0.5))
     rows = rate > at if word == "above" else rate < at
     variables = {"temperature": ("°C", 20.0 + other), "angular rate": ("rad/s", rate), "time": ("s", T)}
-    (one,) = locate(T, acting(4, rows), NOISE, variables, {})
+    (one,) = locate(Misfit(T, acting(4, rows), NOISE), variables, {})
     said = re.fullmatch(r"angular rate (above|below) (\S+) rad/s", one.regime)
     assert said is not None, one.regime
     assert said[1] == word
@@ -140,7 +140,7 @@ def test_the_regime_is_the_variable_with_its_threshold(word: str, seed: int) -> 
 
 def test_a_large_threshold_is_a_plain_number() -> None:
     rate = wandering(1)
-    (one,) = locate(T, acting(4, rate > np.quantile(rate, 0.5)), NOISE, {"effort": ("N m", 500.0 * rate)}, {})
+    (one,) = locate(Misfit(T, acting(4, rate > np.quantile(rate, 0.5)), NOISE), {"effort": ("N m", 500.0 * rate)}, {})
     assert re.fullmatch(r"effort above -?\d+ N m", one.regime), one.regime
 
 
@@ -148,34 +148,36 @@ def test_a_misfit_that_grows_with_a_variable_is_always_there_most_where_that_is_
     rate = wandering(3) + 0.3
     misfit = NOTHING.copy()
     misfit[:, 1] = 10.0 * NOISE[1] * rate * np.sin(2.0 * np.pi * 1.7 * T)
-    (one,) = locate(T, misfit, NOISE, {"other": ("", wandering(50)), "angular rate": ("rad/s", rate)}, {})
+    (one,) = locate(Misfit(T, misfit, NOISE), {"other": ("", wandering(50)), "angular rate": ("rad/s", rate)}, {})
     assert one.regime.startswith("always, most with angular rate above")
     assert one.intervals_s == ((0.0, 40.0),)
 
 
 @pytest.mark.parametrize(("rows", "words"), [(T < 23.0, "in the first 23 s"), (T >= 23.0, "after 23 s")])
 def test_a_regime_of_the_time_is_a_part_of_the_log(rows: np.ndarray, words: str) -> None:
-    (one,) = locate(T, acting(4, rows), NOISE, {"time": ("s", T)}, {})
+    (one,) = locate(Misfit(T, acting(4, rows), NOISE), {"time": ("s", T)}, {})
     assert one.regime == words
 
 
 def test_what_follows_none_of_the_variables_is_given_none() -> None:
     rng = np.random.default_rng(0)
     rows = (rng.random(40) < 0.5)[np.floor(T).astype(int)]
-    (one,) = locate(T, acting(4, rows), NOISE, {"angular rate": ("rad/s", wandering(7)), "tilt": ("rad", wandering(8))}, {})
+    (one,) = locate(
+        Misfit(T, acting(4, rows), NOISE), {"angular rate": ("rad/s", wandering(7)), "tilt": ("rad", wandering(8))}, {}
+    )
     assert one.regime == "no regime: it comes and goes"
 
 
 def test_a_variable_that_never_changes_is_no_regime() -> None:
     rows = (T >= 12.0) & (T < 19.0)
-    (one,) = locate(T, acting(4, rows), NOISE, {"tilt": ("rad", np.zeros(len(T)))}, {})
+    (one,) = locate(Misfit(T, acting(4, rows), NOISE), {"tilt": ("rad", np.zeros(len(T)))}, {})
     assert "tilt" not in one.regime
 
 
 def test_stretches_of_one_log_are_placed_on_its_clock_and_the_hole_between_them_is_nowhere() -> None:
     there = (T < 10.0) | (T >= 30.0)
     t_s, misfit = T[there], acting(1, np.ones(len(T), bool))[there]
-    (one,) = locate(t_s, misfit, NOISE, {}, {"gyro": 1e-9})
+    (one,) = locate(Misfit(t_s, misfit, NOISE), {}, {"gyro": 1e-9})
     assert one.intervals_s == ((0.0, 10.0), (30.0, DURATION_S))
 
 

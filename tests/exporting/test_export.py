@@ -25,8 +25,7 @@ from ruamel.yaml import YAML
 from support.digests import digests
 from support.loaded import loaded_by_command
 
-from imutool.api.logs import export
-from imutool.conversion.run import convert
+from imutool.api.logs import convert, export
 from imutool.converters import euroc
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, ImutoolError, LogError

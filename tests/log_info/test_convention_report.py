@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imutool.api.logs import export
+from imutool.api.logs import convert, export
 from imutool.api.models import debias as debias_recording
-from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.diagnosis.diagnose import diagnose
 from imutool.errors import DataError, ImutoolError, ModelError
@@ -136,7 +135,7 @@ def test_a_diagnosis_says_in_its_remarks_what_is_wrong_with_the_samples(
     told: list[str] = []
 
     def begun(*given: Any) -> None:
-        told.extend(given[6])
+        told.extend(given[2])
         raise StopError
 
     monkeypatch.setattr("imutool.diagnosis.diagnose._beside_reference", begun)

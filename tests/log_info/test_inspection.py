@@ -16,9 +16,9 @@ from mcap.records import MessageIndex
 from mcap.writer import IndexType, Writer
 from support.imu_defects import survey
 
+from imutool.api.logs import convert
 from imutool.cleaning import CleaningSettings, look
 from imutool.cli.info import imu_rows, topic_rows
-from imutool.conversion.run import convert
 from imutool.converters import fetch, tum_vi
 from imutool.debiasing import debias
 from imutool.errors import LogError

@@ -25,6 +25,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from imutool.errors import ConfigError, DataError, LogError
+from imutool.mcap_io import Verified
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu
@@ -35,7 +36,7 @@ from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage import local
 from imutool.mcap_io.storage.source import Digest, Source, sha256
-from imutool.mcap_io.verify import Verified, verify
+from imutool.mcap_io.verify import verify
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 

@@ -129,7 +129,7 @@ def test_a_few_seconds_are_not_enough() -> None:
 
 def test_every_training_log_of_the_data_sets_is_accepted(data: Path, tmp_path: Path) -> None:
     """Among them one of whose truth a tenth is missing, and a robot that stands for a fifth of the time."""
-    from imutool.conversion.run import convert
+    from imutool.api.logs import convert
 
     convert(data / "fetch", tmp_path / "fetch")
     convert(data / "tumvi" / "dataset-room1.tar.gz", tmp_path / "room1.mcap")

@@ -16,7 +16,7 @@ from imutool.array_types import Float64
 from imutool.diagnosis.compare_findings import ALIKE_SHARE
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.jacobians import Chosen, expected
+from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.observability import exclude_each_other
 from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.trial.model_error import FOLLOWING
@@ -68,7 +68,7 @@ def with_common_description(found: Selection, sim: Selection) -> Selection:
 
     They may leave more by `ALIKE_SHARE` of the size, as numbers may that are alike.
     """
-    own, other = (_following(x.whole.chosen, x.always) for x in (found, sim))
+    own, other = (tuple(e for e in x.whole.chosen[x.always :] if e[0].name in FOLLOWING) for x in (found, sim))
     if not own or not other or {e.key for e, _ in own} == {e.key for e, _ in other}:
         return found
     if not all(_is_comparable(effect, found.whole.logs) for effect, _ in other):
@@ -110,10 +110,6 @@ def _motion_squares(log: WhitenedLog) -> Float64[np.ndarray, " k"]:
     white, constant = log.whiten(expected(log.pair, ()))[rows], log.constants[rows]
     size = np.maximum((constant**2).sum(axis=0), np.finfo(np.float64).tiny)
     return np.asarray(((white - constant * ((constant * white).sum(axis=0) / size)) ** 2).sum(axis=0))
-
-
-def _following(chosen: Chosen, always: int) -> Chosen:
-    return tuple(entry for entry in chosen[always:] if entry[0].name in FOLLOWING)
 
 
 def _is_rival(effect: Effect, asked: Effect) -> bool:

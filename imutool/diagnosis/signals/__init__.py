@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import reduce
 from itertools import product
 
 import numpy as np
 
+from imutool.diagnosis.compared_logs import ComparedLogs
 from imutool.diagnosis.estimation.aligned_log import ClockDifference
 from imutool.diagnosis.result import Closer, Diagnosis
 from imutool.diagnosis.settings import DiagnoseSettings
@@ -18,38 +18,32 @@ from imutool.diagnosis.signals.log_fields import on_one_clock
 from imutool.diagnosis.signals.pairing import Pairing, paired
 from imutool.diagnosis.signals.signal_diagnosis import SignalDiagnosis, diagnose_signal
 from imutool.errors import ConfigError, DataError
-from imutool.file_location import Location
 from imutool.mcap_io.fields import others, read_field
+from imutool.report import NamedProgress
 
 BY_OTHERS = frozenset({"pressure", "magnetic", "gnss"})  # kinds whose own physics may be most of the signal
 
 ONE_CLOCK = "The motion of the IMU puts both logs on one clock, so a delay of another signal is relative to the IMU"
 
 
-def check_signals(named: Sequence[str], reals: Sequence[Location], sim: Location | None) -> None:
+def check_signals(asked: ComparedLogs) -> None:
     """Refuse wrong signals before the search.
 
     Raises:
         ConfigError: they need one recording and its simulation.
         LogError: a log has no such field.
     """
-    if named and (sim is None or len(reals) != 1):
+    if asked.signals and (asked.sim is None or len(asked.reals) != 1):
         raise ConfigError("`signals` compare one recording with its simulation", where="signals", fix="Give one log and `sim`")
-    for name, place in product(named, (reals[0], sim)):
+    for name, place in product(asked.signals, (asked.reals[0], asked.sim)):
         if place is not None:
             read_field(place, name)
 
 
 def with_signals(
-    diagnosis: Diagnosis,
-    real: Location,
-    sim: Location,
-    named: Sequence[str],
-    report: Callable[[int, int, str], None],
-    settings: DiagnoseSettings,
-    clock: ClockDifference | None = None,
+    diagnosis: Diagnosis, asked: ComparedLogs, report: NamedProgress, clock: ClockDifference | None = None
 ) -> Diagnosis:
-    """Diagnosis with the signals `named` (TOPIC.field), or with all that both logs hold.
+    """Diagnosis with the signals that are asked for, or with all that both logs hold.
 
     Logs that share no epoch have the `clock` that the IMU's motion shows.
 
@@ -57,8 +51,10 @@ def with_signals(
         ConfigError, LogError: a log cannot be read, or has no such topic.
         DataError: a named signal cannot be compared, or nothing can where there is no IMU.
     """
-    if named:
-        for name in named:
+    real, sim, settings = asked.reals[0], asked.sim, asked.settings
+    assert sim is not None
+    if asked.signals:
+        for name in asked.signals:
             pair = SignalPair.of_fields(on_one_clock(read_field(real, name)), on_one_clock(read_field(sim, name)), name)
             report(3, 4, name)
             diagnosis = _with_signal(diagnosis, diagnose_signal(on_recorded_clock(pair, clock), others(real, name), settings))

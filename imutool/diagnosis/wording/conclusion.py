@@ -61,7 +61,8 @@ def headline(d: Diagnosis) -> str:
 
 def notes(d: Diagnosis) -> list[str]:
     """Further sentences: unusable axes, residuals that remain, unobservable effects."""
-    sentences = [_unusable(place) for place in d.located if place.reason]
+    unusable = [(f"{_upper(_the(at.signal))}'s {', '.join(at.axes)}", at.reason) for at in d.located if at.reason]
+    sentences = [f"{axes} is no measurement: {reason}." for axes, reason in unusable]
     residuals = (_residual(d, signal) for signal in d.unexplained)
     sentences += [f"{_upper(text)}." for text in residuals if text != QUIET]
     if hidden := unobservable(d):
@@ -229,10 +230,6 @@ def _unnamed_place(d: Diagnosis) -> str:
         return ""
     differing = list(dict.fromkeys(place.signal for place in places))
     return f"{_differs(' and '.join(differing))}{_regime(places, differing[0])}, and no known effect explains it"
-
-
-def _unusable(place: Located) -> str:
-    return f"{_upper(_the(place.signal))}'s {', '.join(place.axes)} is no measurement: {place.reason}."
 
 
 def _rings(d: Diagnosis, signal: str) -> bool:

@@ -34,49 +34,15 @@ class Words:
         return "".join(f", {quantity.labelled}" for quantity in unmentioned)
 
 
-def _clock_offset(w: Words) -> str:
-    """tau > 0: a sample shows what happens later, so the reading is ahead."""
-    return f"{w.it} {'lags' if w.main.sign < 0 else 'is ahead of'} {w.other} by {w.main.size}"
-
-
-def _gyro_delay(w: Words) -> str:
-    return f"{w.it} {'is ahead of' if w.main.sign < 0 else 'lags'} the motion by {w.main.size}"
-
-
-def _delay(w: Words) -> str:
-    return f"{w.it} {'comes before' if w.main.sign < 0 else 'lags'} {w.other} by {w.main.size}"
-
-
 def _actuator_delay(w: Words) -> str:
     """A command that acts late; or an effort that is measured, and logged late."""
     what, when = ("is logged", "acts") if w.main.sign < 0 else ("acts", "is commanded")
     return f"the effort {what} {w.main.size} after it {when}"
 
 
-def _clock_skew(w: Words) -> str:
-    """Skew t (1 + eps): eps > 0 puts more motion between two stamps than they say."""
-    return f"the clock of the recording runs {'slow' if w.main.sign > 0 else 'fast'} by {w.main.size}"
-
-
-def _clock_jump(w: Words) -> str:
-    """When, and by how much."""
-    how_far = f" by {w.rest[0]}" if w.rest else ""
-    return f"the clock of the recording jumps{how_far} at {w.main}"
-
-
-def _bias_step(w: Words) -> str:
-    """By how much, and when."""
-    when = f" at {w.rest[0]}" if w.rest else ""
-    return f"its bias steps by {w.main}{when}"
-
-
 def _bias_drift(w: Words) -> str:
     """Size of a warm-up, or rate of a drift whose end the log does not show."""
     return f"its bias drifts by {w.main}{' in all' if w.rest else ', steadily'}"
-
-
-def _driven(w: Words) -> str:
-    return f"{w.it} follows {w.finding.driver or 'another channel of the log'} with {w.main.labelled}"
 
 
 def _unknown(w: Words) -> str:
@@ -167,17 +133,20 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "accel_quadratic": "its error grows with the square of the specific force, by {w.main}",
     "gyro_bias_drift": _bias_drift,
     "accel_bias_drift": _bias_drift,
-    **dict.fromkeys(("gyro_bias_step", "accel_bias_step"), _bias_step),
+    "gyro_bias_step": (step := lambda w: f"its bias steps by {w.main}{f' at {w.rest[0]}' if w.rest else ''}"),
+    "accel_bias_step": step,
     "rate_curve": "{w.it} errs by a curve of the rate, with {w.main}",
     "vibration_rectification": "{w.it} turns vibration into a constant, with {w.main}",
     "lever_arm": "{w.it} sits {w.main} from the tracked point",
     "size_effect": "its three axes sit apart, by {w.main}",
     "mount_rotation": lambda w: f"{w.it} is mounted turned by {w.main}{f' from {w.rest[0]} on' if w.rest else ''}",
-    "clock_offset": _clock_offset,
-    "clock_skew": _clock_skew,
-    "clock_jump": _clock_jump,
+    # tau > 0: a sample shows what happens later, so the reading is ahead
+    "clock_offset": lambda w: f"{w.it} {'lags' if w.main.sign < 0 else 'is ahead of'} {w.other} by {w.main.size}",
+    # t (1 + eps): eps > 0 puts more motion between two stamps than they say
+    "clock_skew": lambda w: f"the clock of the recording runs {'slow' if w.main.sign > 0 else 'fast'} by {w.main.size}",
+    "clock_jump": lambda w: f"the clock of the recording jumps{f' by {w.rest[0]}' if w.rest else ''} at {w.main}",
     "clock_wander": "the clock of the recording wanders, by {w.main}",
-    "gyro_delay": _gyro_delay,
+    "gyro_delay": lambda w: f"{w.it} {'is ahead of' if w.main.sign < 0 else 'lags'} the motion by {w.main.size}",
     "gyro_hysteresis": _hysteresis,
     "accel_hysteresis": _hysteresis,
     "gyro_dead_band": "{w.it} reads zero below {w.main}",
@@ -201,7 +170,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "permuted_axes": "its axes are in another order: {w.finding.equation}",
     "gain": "its gain is {w.main} of that of {w.other}",
     "offset": "{w.it} reads a constant {w.main} too much",
-    "delay": _delay,
+    "delay": lambda w: f"{w.it} {'comes before' if w.main.sign < 0 else 'lags'} {w.other} by {w.main.size}",
     "dead_band": "{w.it} stays still within {w.main} of rest",
     "drift": lambda w: f"{w.it} drifts {'along a smooth curve of the time' if w.finding.curve else f'by {w.main}'}",
     "friction": "{w.it} is held back by friction of {w.main}, which turns with the sign of the motion",
@@ -230,7 +199,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "pressure_temperature": "the barometer follows the temperature, with {w.main}",
     "gnss_lever_arm": "the antenna sits {w.main} from the tracked point",
     "latency": "{w.it} lags {w.other} by {w.main}",
-    "driven": _driven,
+    "driven": lambda w: f"{w.it} follows {w.finding.driver or 'another channel of the log'} with {w.main.labelled}",
     "unknown": _unknown,
 }
 """By effect, what it does to a reading. What a sentence leaves out of its quantities is added behind it."""

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,8 @@ from imutool.mcap_io.recovery.losses import LATEST_NS, Losses, reason
 SCHEMA = int(Opcode.SCHEMA)
 ChunkKey = tuple[int, int, int]  # start and end in ns, unpacked bytes: what a summary says of a chunk wherever it lies
 CDR_HEADS = (b"\0\0", b"\0\1")  # other payloads are not what the channel says, and tell nothing
+SAME_SCHEMA = attrgetter("name", "encoding", "data")  # of two equal ones
+SAME_CHANNEL = attrgetter("topic", "schema_id", "message_encoding")
 SAMPLES = 4  # messages of a channel that must decode by a definition
 
 
@@ -195,13 +198,13 @@ def renumber(
     for recording in recordings:
         first = recording is recordings[0]
         placed = {
-            local: _place(schemas, schema, _same_schema, reuse=not first) for local, schema in sorted(recording.schemas.items())
+            local: _place(schemas, schema, SAME_SCHEMA, reuse=not first) for local, schema in sorted(recording.schemas.items())
         }
         for local in sorted(recording.readable()):
             channel = recording.channels[local]
             topic = recording.renamed.get(local, channel.topic)
             moved = replace(channel, topic=topic, schema_id=placed.get(channel.schema_id, 0))
-            recording.ids[local] = _place(channels, moved, _same_channel, reuse=not first)
+            recording.ids[local] = _place(channels, moved, SAME_CHANNEL, reuse=not first)
         recording.moved = not first or bool(recording.renamed)
         for local, new in recording.renamed.items():
             losses.add_harmless(f"{recording.channels[local].topic} has two types; messages of the second are on {new}")
@@ -235,19 +238,11 @@ def unproven_topics(recordings: Sequence[Recording]) -> list[str]:
     return sorted(topics)
 
 
-def _same_schema(a: Schema, b: Schema) -> bool:
-    return bool((a.name, a.encoding, a.data) == (b.name, b.encoding, b.data))
-
-
-def _same_channel(a: Channel, b: Channel) -> bool:
-    return bool((a.topic, a.schema_id, a.message_encoding) == (b.topic, b.schema_id, b.message_encoding))
-
-
-def _place(known: dict[int, Any], record: Any, same: Callable[[Any, Any], bool], *, reuse: bool) -> int:
+def _place(known: dict[int, Any], record: Any, same: Callable[[Any], object], *, reuse: bool) -> int:
     """Id of a definition: that of an equal one, its own if free, or a new one."""
     if reuse:
         for found, other in known.items():
-            if same(other, record):
+            if same(other) == same(record):
                 return found
     identity: int = record.id if record.id not in known else free_id(known, "definition")
     known[identity] = replace(record, id=identity)

@@ -230,7 +230,7 @@ class FolderTarget:
             raise ConfigError("the target holds the log itself", where=self.path, expected="another folder")
         within = sorted(entry.relative_to(self.path) for entry in self.path.rglob("*"))
         foreign = [str(entry) for entry in within if not (re.fullmatch(self.holds, entry.as_posix()) and self._makes(entry))]
-        if foreign or not self._was_made_here():
+        if foreign or SIGNATURE.encode() not in first_bytes(self.path / self.signed, len(SIGNATURE) + 80):
             what = (
                 f"the target holds {foreign[0]}, which this export does not make"
                 if foreign
@@ -243,9 +243,6 @@ class FolderTarget:
         if not self.temporary.is_dir() or not (self.path / entry).is_dir():
             return True
         return (self.temporary / entry).is_dir() and not (self.path / entry).is_symlink()
-
-    def _was_made_here(self) -> bool:
-        return SIGNATURE.encode() in first_bytes(self.path / self.signed, len(SIGNATURE) + 80)
 
     def __enter__(self) -> Path:
         return self.temporary

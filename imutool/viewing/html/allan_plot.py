@@ -12,8 +12,7 @@ from imutool.mcap_io.storage.target import Target
 from imutool.noise import allan
 from imutool.noise_identification import CurveSource, IdentifiedNoise
 from imutool.units import AXES, SENSORS, UNITS, Sensor
-from imutool.viewing.html.drawing import Panel, Picture, decades, legend, plain_tick_labels
-from imutool.viewing.html.drawing import png as drawn
+from imutool.viewing.html.drawing import Panel, Picture, decades, legend, plain_tick_labels, png
 from imutool.viewing.html.page import AXIS_COLORS, SOFT, TITLES
 
 LINES = {
@@ -34,23 +33,15 @@ def write_png(identified: IdentifiedNoise, path: Path, *, overwrite: bool) -> No
     Raises:
         ConfigError: matplotlib is not installed, or the file exists or cannot be written.
     """
-    with Target(path, overwrite=overwrite) as target:  # refuses before the work is done, leaves nothing after a failure
-        target.write(png(identified))
-
-
-def png(identified: IdentifiedNoise) -> bytes:
-    """Content of the PNG file of `write_png`.
-
-    Raises:
-        ConfigError: matplotlib is not installed.
-    """
     sources = [source for source in (identified.at_rest, identified.in_motion) if source is not None]
     panels = [
         Panel(partial(_draw, source=source, sensor=sensor), HEIGHT_INCH, f"{TITLES[sensor]}: {source.how}")
         for source in sources
         for sensor in SENSORS
     ]
-    return drawn(Picture("allan", "Allan deviation", "", tuple(panels)), f"{identified.log} {identified.topic}")
+    picture = Picture("allan", "Allan deviation", "", tuple(panels))
+    with Target(path, overwrite=overwrite) as target:  # leaves nothing after a failure
+        target.write(png(picture, f"{identified.log} {identified.topic}"))
 
 
 def _draw(figure: Any, *, source: CurveSource, sensor: Sensor) -> None:

@@ -29,7 +29,7 @@ from imutool.mcap_io.storage.target import Target
 from imutool.units import ASCII_UNITS
 from imutool.viewing.html import diagnosis_figures as figures
 from imutool.viewing.html import diagnosis_paths
-from imutool.viewing.html.drawing import prefix_ids
+from imutool.viewing.html.drawing import figure_of
 from imutool.viewing.html.page import document, text
 
 BAR_PIXELS = 80.0
@@ -89,10 +89,11 @@ def _findings(d: Diagnosis) -> Iterator[str]:
     yield "<h2>Unmodelled effects</h2>"
     yield f'<div class="scroll"><table class="findings"><thead><tr>{head}</tr></thead><tbody>'
     for finding in d.findings:
+        python = f"<pre>{text(finding.python)}</pre>" if finding.python else ""
         cells = [
             f"<strong>{text(label(finding))}</strong> {text(finding.signal)}"
             f"<br>{text(effect_sentence(d, finding))}{_similar(finding)}",
-            f"<code>{text(finding.equation)}</code>{_python(finding)}{_entries(finding)}",
+            f"<code>{text(finding.equation)}</code>{python}{_entries(finding)}",
             _gain(finding),
             f"<span class=entry>{text(chance_text(finding.false_discovery_rate, short=True))}</span>",
         ]
@@ -126,10 +127,6 @@ def _entries(finding: Finding) -> str:
     return "".join(out)
 
 
-def _python(finding: Finding) -> str:
-    return f"<pre>{text(finding.python)}</pre>" if finding.python else ""
-
-
 def _locations(d: Diagnosis) -> Iterator[str]:
     if not d.located:
         return
@@ -145,7 +142,7 @@ def _locations(d: Diagnosis) -> Iterator[str]:
             f"{text(trace.log)}: local size of the misfit{_band(trace)}, by axis (each sensor to its own largest). "
             '<span class="key" style="background: var(--mark)"></span>located misfit' + HELD
         )
-        yield _figure(figures.misfit_strip(d, trace), f"w{k}", caption)
+        yield figure_of(figures.misfit_strip(d, trace), f"w{k}", caption)
 
 
 def _closed(first: Diagnosis, second: Diagnosis) -> Diagnosis:
@@ -185,18 +182,18 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
     yield f"<h2>{'Before and after' if found else 'Difference'}</h2>"
     for k, trace in enumerate(d.traces[:MAX_LOGS]):
         drawn = figures.residual(trace, found=found)
-        yield _figure(drawn, f"r{k}", f"{text(trace.log)}: over time{_band(trace)}. {legend}{HELD}")
+        yield figure_of(drawn, f"r{k}", f"{text(trace.log)}: over time{_band(trace)}. {legend}{HELD}")
     found_in = {s: any(f"{s}.".startswith(f"{f.signal}.") for f in d.findings) for s in d.signals}  # or in a whole topic
     for k, signal in enumerate(sorted(d.signals, key=lambda signal: not found_in[signal])):
         drawn = figures.scalar_signal(d.signals[signal], found=found_in[signal])
-        yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {legend}{HELD}")
+        yield figure_of(drawn, f"g{k}", f"{text(signal)}: over time. {legend}{HELD}")
     if len(d.traces) > MAX_LOGS:
         yield f'<p class="note">The first {MAX_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'
     if not d.traces:
         return
     spectrum, rate, attitude = figures.spectrum(d), figures.residual_against_rate(d), figures.residual_against_attitude(d)
     if spectrum is not None:
-        yield _figure(
+        yield figure_of(
             spectrum, "s", f"Spectrum over {over} (Welch, mean of the axes); dashed: white noise of the floor's size. {legend}"
         )
     else:
@@ -204,14 +201,14 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
     paths = diagnosis_paths.paths(d)
     if paths is not None:
         true = '<span class="key" style="background: var(--ink); opacity: 0.4"></span>true'
-        yield _figure(
+        yield figure_of(
             paths, "p", f"Integrated from the true start of each stretch of {over}; drift as root mean square.{true}{legend}"
         )
     bands = "means in bins, with two standard errors"
     if rate is not None:
-        yield _figure(rate, "t", f"Against turning rate over {over}: {bands}. {legend}")
+        yield figure_of(rate, "t", f"Against turning rate over {over}: {bands}. {legend}")
     if attitude is not None:
-        yield _figure(attitude, "a", f"Against attitude over {over}: {bands}. {legend}")
+        yield figure_of(attitude, "a", f"Against attitude over {over}: {bands}. {legend}")
     else:
         yield '<p class="note">The attitude is unknown, so there is no figure against it.</p>'
 
@@ -221,7 +218,7 @@ def _curves(d: Diagnosis) -> Iterator[str]:
         if finding.curve is not None:
             yield "<h2>Unnamed misfit</h2>"
             caption = f"{text(finding.equation)}: a smooth curve of {text(finding.curve.variable)}, with one standard deviation"
-            yield _figure(figures.curve(finding.curve, finding.signal), f"c{k}", caption)
+            yield figure_of(figures.curve(finding.curve, finding.signal), f"c{k}", caption)
 
 
 def _left(d: Diagnosis) -> Iterator[str]:
@@ -269,7 +266,3 @@ def _samples(trace: Traces) -> str:
 def _band(trace: Traces) -> str:
     """Frequency up to which the expected signal is known."""
     return "" if trace.band_hz is None else f" below {trace.band_hz:.2g} Hz, up to where the poses know the motion"
-
-
-def _figure(svg: str, prefix: str, caption: str) -> str:
-    return f"<figure>{prefix_ids(svg, prefix)}<figcaption>{caption}</figcaption></figure>"

@@ -133,9 +133,10 @@ def png(picture: Picture, heading: str) -> bytes:
         return _content(figure, format="png", metadata={"Software": None})
 
 
-def prefix_ids(drawn: str, prefix: str) -> str:
-    """Prefix all identifiers of an `<svg>` element: a page holds several drawings."""
-    return re.sub(r'(?<= id=")|(?<=href="#)|(?<=url\(#)', f"{prefix}-", drawn)
+def figure_of(drawn: str, prefix: str, caption: str = "") -> str:
+    """Figure of a drawing, whose identifiers get a prefix: a page holds several drawings."""
+    own = re.sub(r'(?<= id=")|(?<=href="#)|(?<=url\(#)', f"{prefix}-", drawn)
+    return f"<figure>{own}{f'<figcaption>{caption}</figcaption>' if caption else ''}</figure>"
 
 
 def legend(figure: Any, artists: Sequence[Any]) -> None:

@@ -16,7 +16,7 @@ from imutool.errors import ConfigError
 from imutool.file_location import Location
 from imutool.mcap_io.storage.target import Target
 from imutool.viewing.html import report_errors, report_paths, report_signals
-from imutool.viewing.html.drawing import HALF_INCH, WIDTH_INCH, Panel, Picture, png, prefix_ids, require_matplotlib, svg
+from imutool.viewing.html.drawing import HALF_INCH, WIDTH_INCH, Panel, Picture, figure_of, png, require_matplotlib, svg
 from imutool.viewing.html.page import cards, document, text
 from imutool.viewing.html.report_wording import (
     conclusion,
@@ -191,7 +191,7 @@ def _drawn(picture: Picture, key: str, drawn: Mapping[str, str]) -> Iterator[str
     yield '<div class="pair">' if not picture.panels[0].wide else "<div>"
     for k, panel in enumerate(picture.panels):
         name = f"{key}-{picture.name}-{k}"
-        yield f"<figure>{prefix_ids(drawn.get(name) or _svg(panel, picture.name, k), name)}</figure>"
+        yield figure_of(drawn.get(name) or _svg(panel, picture.name, k), name)
     yield "</div></section>"
 
 

@@ -16,7 +16,7 @@ from imutool import __version__
 from imutool.array_types import Bool
 from imutool.bias.model import GAP_S
 from imutool.bias_start.aided_path import residual_prior
-from imutool.bias_start.model_choice import check_start
+from imutool.bias_start.model_choice import check_start, fitness_in_memory
 from imutool.errors import ConfigError
 from imutool.file_location import Location
 from imutool.inertial.aids import Aids, listed, parse_aids
@@ -119,17 +119,14 @@ def _with_models(
         return [], [], {}
     from imutool.bias_start.bias_from_truth import TRUTH_S
     from imutool.bias_start.correction import apply_with_std
-    from imutool.bias_start.fitness import judge
-    from imutool.bias_start.initial_bias import model_samples
     from imutool.evaluation import started
     from imutool.log_info.convention_report import contradictions, warn_of_recordings
 
     method = "smooth" if smooth else f"truth:{TRUTH_S:g}" if init == "truth" else init
-    runs, aided, origins, about = list[Run](), list[Run](), {}, recording.metadata.get("imutool", {})
+    runs, aided, origins = list[Run](), list[Run](), dict[str, str]()
     wrong = [text for whole in warn_of_recordings([recording]) for text in contradictions(whole)]
     for name, model, start in started(recording, models, init, log, smooth=smooth, force=True):
-        fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong)
-        fit = fit.report(name, recording.name, force=True)
+        fit = fitness_in_memory(model, start, recording, wrong).report(name, recording.name, force=True)
         notes += [] if fit.verdict == "fits" else [fit.sentence(f"The model {name}")]
         debiased, std = apply_with_std(model, start, recording.imu)
         runs.append(Run(name, debiased.imu, debiased.bias[:, :3], debiased.bias[:, 3:], std, method))

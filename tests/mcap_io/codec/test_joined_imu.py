@@ -10,7 +10,7 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from imutool import info
-from imutool.conversion.run import convert
+from imutool.api.logs import convert
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.codec import schemas

@@ -12,7 +12,7 @@ import pytest
 from google.protobuf import descriptor_pb2, timestamp_pb2
 from mcap.writer import Writer
 
-from imutool.conversion.run import convert
+from imutool.api.logs import convert
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
 from imutool.mcap_io.log import Log

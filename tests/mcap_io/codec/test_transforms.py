@@ -10,8 +10,8 @@ import pytest
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from imutool.api.logs import convert
 from imutool.cleaning.truth import read_truth
-from imutool.conversion.run import convert
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log

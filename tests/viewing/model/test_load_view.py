@@ -12,9 +12,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from support.imu_defects import batch_of, late, pick, repeated, with_values, write_log
 
+from imutool.api.logs import convert
 from imutool.bias_start.correction import apply, apply_with_std
 from imutool.cleaning.survey import raw_batches
-from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.evaluation import evaluate, started
