@@ -299,8 +299,11 @@ ZEROS = np.zeros((2, len(STILL.imu), 3))
             lambda: imutool.train("a.mcap", "m.safetensors", settings={"steps": -1}),
             "settings: steps: is -1, out of range; expected an integer >=",
         ),
+        (lambda: imutool.convert("a.mcap", "b.mcap", format="eurok"), "format: .*Did you mean 'euroc'"),
+        (lambda: imutool.clean("a.mcap", rules="spike"), "rules: .*Did you mean 'spikes'"),
+        (lambda: imutool.clean("a.mcap", skip_rules="spike"), "skip_rules: .*Did you mean 'spikes'"),
     ],
-    ids=range(27),
+    ids=range(30),
 )
 def test_a_value_of_another_kind_is_said(call: Callable[[], object], said: str) -> None:
     with pytest.raises(imutool.ImutoolError, match=said):

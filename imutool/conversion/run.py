@@ -87,7 +87,7 @@ def convert(
     labels = Labels(sensor, parse_kinds(kinds), parse_pair(imu))
     corrected = tuple(name for name, asked in ((CONVENTIONS, fix), (STAMPS, restamp)) if asked)
     template = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
-    if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
+    if format != AUTO and not hasattr(module := registry.load(GROUP, format, "format"), "sequences"):
         return _from_stream(module, source, out, sequences, replace(template, converter=format), progress)
     if is_stream(source) and not source.is_file():  # its reader would wait, and a converter reads it more than once
         raise ConfigError("is a pipe or a device", where=source, expected="a file or a folder", fix="Write it to a file first")

@@ -164,7 +164,7 @@ def _udp(host: str, port: int, malformed: Malformed) -> Samples:
     except OSError as error:
         line.close()
         raise ConfigError(
-            f"cannot be bound ({error.strerror})", where=f"udp://{host}:{port}", fix="Choose another port"
+            f"cannot be bound ({error.strerror})", where=f"udp://{host}:{port}", fix="Choose another host or port"
         ) from error
     line.settimeout(WAIT_S)
 
