@@ -65,6 +65,9 @@ class Log:
         self.topics = MappingProxyType(topics_of(self.index))
         self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, self.firsts, self.rows)})
 
+    def __repr__(self) -> str:
+        return f"<log {self.path}: {self.listing()}>"
+
     def __enter__(self) -> Log:
         return self
 
