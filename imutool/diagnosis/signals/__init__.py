@@ -34,7 +34,7 @@ def check_signals(named: Sequence[str], reals: Sequence[Location], sim: Location
         LogError: a log has no such field.
     """
     if named and (sim is None or len(reals) != 1):
-        raise ConfigError("fields of one recording and its simulation are compared", where="signals", fix="Give one log and `sim`")
+        raise ConfigError("needs one recording and its simulation", where="signals", fix="Give one log and `sim`")
     for name, place in product(named, (reals[0], sim)):
         if place is not None:
             read_field(place, name)
