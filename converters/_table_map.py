@@ -6,6 +6,7 @@ What the columns themselves leave open is for the user to state: in a map file, 
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -91,9 +92,10 @@ def read_map(mapping: Path | Mapping[str, Any]) -> Entries:
     """
     where = mapping if isinstance(mapping, Path) else "mapping"
     values = _toml(mapping) if isinstance(mapping, Path) else dict(mapping)
-    for name in {*LISTS} & {*values}:
+    for name in {*LISTS, *OF_COUNTS} & {*values}:
         if isinstance(values[name], str) and "," in values[name]:
-            values[name] = [column.strip() for column in values[name].split(",")]
+            columns = [column.strip() for column in values[name].split(",")]
+            values[name] = [*map(_number, columns)] if name in OF_COUNTS else columns
     for name in [name for name in values if name not in TableMap.__struct_fields__]:
         known = TableMap.__struct_fields__
         fix = did_you_mean(name, known, "{}")
@@ -101,7 +103,9 @@ def read_map(mapping: Path | Mapping[str, Any]) -> Entries:
     try:
         table = msgspec.convert(values, TableMap)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"is no map of a table ({error})", where=where) from error
+        name = re.sub(r"\W.*", "", str(error).partition("`$.")[2])
+        expected = "numbers" if name in {"rate_hz", *OF_COUNTS} else "names of columns" if name in LISTS else "text"
+        raise ConfigError(f"{name} is {values[name]!r}", where=where, expected=expected) from error
     given = {name: getattr(table, name) for name, value in values.items() if value not in ("", [])}
     for name, units in {**UNITS_OF, "pose_kind": KINDS, "pose_world": WORLDS}.items():
         if name in given and given[name] not in units:
@@ -115,6 +119,14 @@ def read_map(mapping: Path | Mapping[str, Any]) -> Entries:
         if name in given and not isinstance(given[name], str) and len(given[name]) != count:
             raise ConfigError(f"{name} names {len(given[name])} columns", where=where, expected=f"{count}: {of}")
     return given
+
+
+def _number(text: str) -> float | str:
+    """Number in a text, or the text where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _toml(path: Path) -> dict[str, Any]:

@@ -120,8 +120,10 @@ def commands() -> str:
         import typer
 
         from imutool.cli import load
+        from imutool.cli.overview import COMMANDS
 
-        root = typer.main.get_command(load())
+        root: Any = typer.main.get_command(load())
+    root.commands = {name: root.commands[name] for name in COMMANDS}  # in the order of --help
     return "\n".join([INTRODUCTION, *sections(root, "imutool")])
 
 

@@ -109,8 +109,8 @@ if not TYPE_CHECKING:  # a type checker names a misspelt attribute
 
 
 def __dir__() -> list[str]:
-    """Public names, also before they are imported."""
-    return sorted({*globals(), *__all__})
+    """Public names, also before they are imported; no modules, which are private."""
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})
 
 
 if not (_Path(__file__).parent / "converters").is_dir():  # a checkout: the wheel puts the folder inside the package

@@ -60,7 +60,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, logs: Path) -> Path:
 def test_all_that_is_promised_is_public() -> None:
     assert set(imutool.__all__) >= REQUIRED
     assert list(imutool.__all__) == sorted(set(imutool.__all__))
-    assert set(imutool.__all__) <= set(dir(imutool))
+    assert {name for name in dir(imutool) if not name.startswith("__")} == {*imutool.__all__} - {"__version__"}
     for name in imutool.__all__:
         getattr(imutool, name)
 
@@ -194,6 +194,7 @@ def test_a_recording_is_debiased_as_its_log_is(tmp_path: Path, logs: Path) -> No
     by_name = imutool.debias(imutool.read(source), model=model)
     imutool.debias(str(source), tmp_path / "out.mcap", model=model)
     with imutool.Log(tmp_path / "out.mcap") as log:
+        assert repr(log).startswith(f"<log {tmp_path / 'out.mcap'}: /imu0 (sensor_msgs/msg/Imu), ")
         batches = list(raw_batches(log, "/imu0/debiased"))
     gyro, accel = (np.concatenate([getattr(batch, name) for batch in batches]) for name in ("gyro", "accel"))
     for debiased in (from_arrays, by_name):
@@ -227,11 +228,13 @@ def test_samples_one_by_one_are_debiased_as_the_recording_is(logs: Path) -> None
         (imutool.debias, "one of the two"),
         (lambda log: imutool.debias(log, "out.mcap", in_place=True), "one of the two"),
         (lambda log: imutool.debias(log, "out.mcap", model=imutool.load_model("static")), "a model file"),
+        (lambda log: imutool.debias(log, "static"), "target: 'static' is a model; expected the new log"),
+        (lambda log: imutool.debias(log, "fetch-hybrid"), "target: 'fetch-hybrid' is a model"),
         (lambda log: imutool.view(log, html="x.html", align="sideways"), "none, origin, yaw, se3"),
         (lambda log: imutool.export("s3://bucket/log.mcap", "out", format="euroc"), "a file on this machine"),
         (lambda log: imutool.train([log], "m.safetensors", settings={"step": 3}), "Did you mean steps"),
     ],
-    ids=["no target", "both targets", "loaded model", "alignment", "url", "setting"],
+    ids=["no target", "both targets", "loaded model", "model as target", "shipped as target", "alignment", "url", "setting"],
 )
 def test_what_cannot_be_is_said(call: Callable[[str], object], said: str, logs: Path, tmp_path: Path) -> None:
     with pytest.raises(imutool.ConfigError, match=said):
@@ -299,8 +302,11 @@ ZEROS = np.zeros((2, len(STILL.imu), 3))
             lambda: imutool.train("a.mcap", "m.safetensors", settings={"steps": -1}),
             "settings: steps: is -1, out of range; expected an integer >=",
         ),
+        (lambda: imutool.convert("a.mcap", "b.mcap", format="eurok"), "format: .*Did you mean 'euroc'"),
+        (lambda: imutool.clean("a.mcap", rules="spike"), "rules: .*Did you mean 'spikes'"),
+        (lambda: imutool.clean("a.mcap", skip_rules="spike"), "skip_rules: .*Did you mean 'spikes'"),
     ],
-    ids=range(27),
+    ids=range(30),
 )
 def test_a_value_of_another_kind_is_said(call: Callable[[], object], said: str) -> None:
     with pytest.raises(imutool.ImutoolError, match=said):

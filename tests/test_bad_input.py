@@ -171,7 +171,8 @@ def test_a_log_without_imu_is_refused_with_its_topics(refuse: Refuse, talk: str)
     message = refuse(LOG, "debias", talk, "out.mcap")
     assert message.startswith(talk)
     assert "IMU" in message
-    assert "/chatter" in refuse(LOG, "evaluate", talk)
+    for words in (["evaluate"], ["export", "out", "--format", "euroc"], ["live", "--no-view"]):
+        assert "/chatter" in refuse(LOG, words[0], talk, *words[1:])
 
 
 def test_a_log_without_imu_is_described_with_a_warning(tmp_path: Path, imutool: Run, talk: str) -> None:

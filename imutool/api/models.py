@@ -15,7 +15,7 @@ from imutool.api import Init, checked, init_text
 from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import BiasModel
-from imutool.bias.model_file import find_model, shipped_for
+from imutool.bias.model_file import find_model, library, shipped_for
 from imutool.bias_start import DEBIASED_BY, Fitness
 from imutool.bias_start.correction import apply_with_std
 from imutool.bias_start.earlier_load import switched_on_before
@@ -226,6 +226,8 @@ def _log_to_debias(
     place = location(source)
     if isinstance(model, BiasModel) or isinstance(target, BiasModel):
         raise ConfigError("this is a loaded model", where="model", expected="a model file, whose digest goes into the log")
+    if target == static.Model.method or (library() / f"{target}.safetensors").is_file():
+        raise ConfigError(f"{target!r} is a model", where="target", expected="the new log", fix="Give the model as `model`")
     if in_place == (target is not None):
         raise ConfigError("neither or both of `target` and `in_place` are given", where="debias", expected="one of the two")
     out, given = None if target is None else location(target), list(model.values()) if isinstance(model, Mapping) else model

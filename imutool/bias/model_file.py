@@ -165,7 +165,7 @@ def find_model(name: str | Path, rate_hz: float | None = None) -> BiasModel:
     path = model_file(name)
     if path.suffix.lower() == ".toml":
         if rate_hz is None:
-            raise ModelError("a physics.toml has no sample rate", where=path, expected="`rate_hz`, or a trained model")
+            raise ModelError("a physics.toml has no rate", where=path, expected="a trained model, or `rate_hz` in Python")
         from imutool.bias import physics
 
         with suppress(OSError):  # the reader reports it

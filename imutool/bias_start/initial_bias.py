@@ -230,7 +230,7 @@ def from_numbers(text: str) -> InitialBias:
     except ValueError:
         rest = np.zeros(0)
     if rest.shape != (6,) or not (np.abs(rest) <= MAX).all():
-        raise ConfigError(f"{text!r}", where="init", expected=f"{', '.join(METHODS)} or gx,gy,gz,ax,ay,az")
+        raise ConfigError(f"{text!r}", where="init", expected=f"{', '.join(METHODS)}, truth:SECONDS or gx,gy,gz,ax,ay,az")
     return InitialBias(rest, np.zeros(6), "given")
 
 

@@ -44,9 +44,9 @@ class CleaningSettings(Settings, frozen=True, kw_only=True):
             ConfigError: a name that is no rule; the message names the nearest.
         """
         known = every()
-        for name in (*self.only, *self.without):
-            if name not in known:
-                registry.load(GROUP, name)  # says what was meant
+        for parameter, given in (("rules", self.only), ("skip_rules", self.without)):
+            for name in set(given) - set(known):
+                registry.load(GROUP, name, parameter)  # says what was meant
         return [name for name in known if (not self.only or name in self.only) and name not in self.without]
 
 

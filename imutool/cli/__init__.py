@@ -26,7 +26,7 @@ WRONG_USAGE, INTERRUPTED, TERMINATED = 2, 130, 143  # what a shell reports of a 
 
 
 def load(words: Sequence[str] = ()) -> App:
-    """Application with the command that `words` ask for, or with all in the order of --help."""
+    """Application with the command that `words` ask for, or with all."""
     name = next((word for word in words if not word.startswith("-")), "")
     for module in (COMMANDS[name][0],) if name in COMMANDS else MODULES:
         import_module(f"imutool.cli.{module}")

@@ -196,7 +196,9 @@ LogUrls = Annotated[list[str], typer.Argument(metavar="LOG", help="MCAP logs: fi
 Models = Annotated[
     list[str] | None, typer.Option("--model", help="Model file, physics.toml, a name that ships, or static. Repeatable.")
 ]
-Init = Annotated[str, typer.Option(help="Initial bias: auto, stationary, prior, truth, or gx,gy,gz,ax,ay,az (rad/s, m/s²).")]
+Init = Annotated[
+    str, typer.Option(help="Initial bias: auto, stationary, prior, truth, truth:SECONDS, or gx,gy,gz,ax,ay,az (rad/s, m/s²).")
+]
 Smooth = Annotated[bool, typer.Option("--smooth", help="Use the whole log for each sample's bias: more accurate, not causal.")]
 Aid = Annotated[
     str | None,

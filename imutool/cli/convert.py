@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from imutool.cli.app import COMMON, Common, Written, app, listing
+from imutool.cli.app import COMMON, Common, Quiet, Verbose, Written, app, listing
 from imutool.cli.parameters import with_flags
-from imutool.cli.terminal import say, tell_error, tell_warning
+from imutool.cli.terminal import log_to_stderr, say, tell_error, tell_warning
 from imutool.config import entries
 from imutool.errors import LOST, DataError
 from imutool.mcap_io.storage.local import is_stream
@@ -150,10 +150,13 @@ def new_converter(
     folder: Annotated[
         Path | None, typer.Option("--output", "--folder", "-o", metavar="DIR", help="New folder; by default imutool-NAME.")
     ] = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
 ) -> None:
     """Write a template of a converter, with a test, as a package of its own."""
     from imutool.conversion.converter_template import write_template
 
+    log_to_stderr(verbose, quiet)
     place = Path(f"imutool-{name}") if folder is None else folder
     for path in write_template(name, place):
         say(str(path))

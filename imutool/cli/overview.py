@@ -12,25 +12,25 @@ NARROW = 80  # columns: with fewer, the tables of a command's help cut the names
 # A test compares names and texts with the commands themselves. The order is that of the page.
 COMMANDS: Mapping[str, tuple[str, str]] = {  # by name: the module, and the first line of the command's help
     "convert": ("convert", "Convert any recording with an IMU to MCAP; the format is recognised."),
-    "export": ("convert", "Write a log as a EuRoC or rosbag2 folder, or a diagnosed sensor for a simulator."),
-    "new-converter": ("convert", "Write a template of a converter, with a test, as a package of its own."),
     "info": ("info", "Report the topics, quality and damage of a log; with --noise, also its IMU noise."),
-    "repair": ("clean", "Save the intact messages of a damaged log or ROS 1 bag, and report the losses."),
     "train": ("train", "Train a bias model on logs of one sensor with true poses."),
     "debias": ("debias", "Write a log with a debiased IMU topic; all other messages stay unchanged."),
     "clean": ("clean", "Find the defects of a log's IMU, and say whether the log can be trusted."),
+    "repair": ("clean", "Save the intact messages of a damaged log or ROS 1 bag, and report the losses."),
+    "fleet": ("fleet_view", "Process many logs on all cores of this machine, or on a Ray cluster."),
     "evaluate": ("evaluate", "Integrate the IMU from the true start, raw and debiased, and compare it with the truth."),
     "vio": ("evaluate", "Score a visual-inertial estimate on the log's IMU, raw and with each model."),
+    "export": ("convert", "Write a log as a EuRoC or rosbag2 folder, or a diagnosed sensor for a simulator."),
     "view": ("view", "Show truth, raw and debiased: in the Rerun viewer, in a browser, or as files."),
     "live": ("live", "Debias a stream of samples as it comes, show it, and measure the delay."),
     "simulate": ("simulate", "Simulate an IMU, with a sensor's physics and noise."),
-    "conceal": ("simulate", "Make a sealed blind case, or open one and score the findings."),
     "diagnose": ("diagnose", "Find physics that a simulation leaves out, by comparison with a recording."),
     "audit": ("diagnose", "Find the errors of a simulator's IMU, without a recording."),
+    "conceal": ("simulate", "Make a sealed blind case, or open one and score the findings."),
     "models": ("models", "List the models that come with imutool: method, sensor, data set and rate."),
     "schema": ("models", "Print the JSON Schema of a report, or list the reports."),
+    "new-converter": ("convert", "Write a template of a converter, with a test, as a package of its own."),
     "demo": ("demo", "Run a demo without download: convert, train, debias, evaluate, view."),
-    "fleet": ("fleet_view", "Process many logs on all cores of this machine, or on a Ray cluster."),
 }
 MODULES = tuple(dict.fromkeys(module for module, _ in COMMANDS.values()))
 ABOUT = "Convert IMU recordings to MCAP, train bias models, debias logs, diagnose and view them."

@@ -38,6 +38,7 @@ ALIASES = {
     "sequences": ("sequence",),
     "settings": ("set_", "config"),  # those of a file name the file
     "signals": ("signal",),
+    "skip_rules": ("no_rule",),
 }
 # What a user types whom another command, or another tool, has taught; and what serves that purpose, if a command has it.
 TAUGHT_ELSEWHERE = (
@@ -120,10 +121,11 @@ def error_with_flags(error: ImutoolError, flag_of: Mapping[str, str], typed: Col
     """Error with flags for parameters; what was typed stays, also if it reads like a parameter."""
     where = error.where
     if where is not None and where not in typed:
-        parts = [PLACE.fullmatch(part) for part in where.split(", ")]
+        names, colon, setting = where.partition(": ")  # of `settings: steps` the setting stays
+        parts = [PLACE.fullmatch(part) for part in names.split(", ")]
         shown = [None if part is None else _shown(part[1], part[2], flag_of) for part in parts]
         if None not in shown:
-            where = ", ".join(map(str, shown))
+            where = ", ".join(map(str, shown)) + colon + setting
     what, expected, fix = (with_flags(text, flag_of) for text in (error.what, error.expected, error.fix))
     return error.replaced(what=what, where=where, expected=expected, fix=fix)
 

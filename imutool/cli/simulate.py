@@ -165,7 +165,9 @@ def _open(folder: Path, findings: Path | None, json_to: str | None, overwrite: b
 
     from imutool.blind_cases import open_case
 
-    if findings is None and (folder / "sim.mcap").exists() and not (folder / "findings.json").exists():
+    if not (folder / "envelope.json").exists():
+        raise DataError("holds no blind case", where=folder, expected="a folder that imutool conceal made")
+    if findings is None and not (folder / "findings.json").exists():
         fix = f"Run imutool diagnose {folder}/real.mcap --sim {folder}/sim.mcap -o {folder}"
         raise DataError("holds no findings.json to score", where=folder, expected="a case after its diagnosis", fix=fix)
     result: dict[str, Any] = msgspec.to_builtins(open_case(folder, findings))

@@ -262,12 +262,16 @@ def figures(results: Sequence[dict[str, Any]], *, aligned: bool = False) -> None
     whole["velocity\nm/s"] = "velocity_rmse_m_s"
     drift = {f"{window}\n°": "drift_orientation_deg", "expected\n°": "drift_orientation_std_deg"}
     drift |= {f"{window}\nm/s": "drift_velocity_m_s", "expected\nm/s": "drift_velocity_std_m_s"}
-    named = [{title: name for title, name in whole.items() if aligned or name != "aoe_aligned_deg"}, drift]
-    shown = [[(title, [each.get(name) for each in results]) for title, name in columns.items()] for columns in named]
+    without_aids = [each for each in results if each.get("estimate") != "aided"]  # as the windows are
+    named = [(results, {title: name for title, name in whole.items() if aligned or name != "aoe_aligned_deg"})]
+    named.append((without_aids, drift))
+    shown = [
+        (scores, [(title, [each.get(name) for each in scores]) for title, name in cells.items()]) for scores, cells in named
+    ]
     for title, by in (("ROE °", "roe_deg"), ("RPE m", "rpe_m")):
-        shown.append([(f"{title}\n{metres} m", [each[by][metres] for each in results]) for metres in results[0][by]])
-    for columns in shown:
+        shown.append((results, [(f"{title}\n{metres} m", [each[by][metres] for each in results]) for metres in results[0][by]]))
+    for scores, columns in shown:
         if any(value is not None for _, values in columns for value in values):  # a path without positions has no distances
             values = zip(*([MISSING if x is None else f"{x:.2f}" for x in column] for _, column in columns), strict=True)
-            rows = [(each["log"], each["model"], *row) for each, row in zip(results, values, strict=True)]
+            rows = [(each["log"], each["model"], *row) for each, row in zip(scores, values, strict=True)]
             table([("log", "model", *(title for title, _ in columns)), *rows], keys=2)

@@ -79,7 +79,7 @@ def convert(
         ConfigError: unknown format or sequence, a pipe, two of one name, a target that exists or cannot be made.
         ImutoolError: the only sequence there is (or was asked for) failed; of several, failures go to the report.
     """
-    if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
+    if format != AUTO and not hasattr(module := registry.load(GROUP, format, "format"), "sequences"):
         return _from_stream(module, source, out, sequences, replace(template, converter=format), progress)
     if is_stream(source) and not source.is_file():  # its reader would wait, and a converter reads it more than once
         raise ConfigError("is a pipe or a device", where=source, expected="a file or a folder", fix="Write it to a file first")

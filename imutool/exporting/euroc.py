@@ -110,9 +110,11 @@ def _best_imu(log: Log) -> str:
     """
     every = log.with_schema((schemas.IMU,))
     found = [t.name for t in every if t.is_derived] or [t.name for t in every]
-    if len(found) != 1:
-        what = f"the log has {len(found)} IMU topics: {', '.join(found)}" if found else "the log has no IMU"
-        raise LogError(what, where=log.path, expected="one", fix="Choose one with `imu`" if found else "")
+    if not found:
+        raise log.no_imu()
+    if len(found) > 1:
+        what = f"the log has {len(found)} IMU topics: {', '.join(found)}"
+        raise LogError(what, where=log.path, expected="one", fix="Choose one with `imu`")
     return found[0]
 
 

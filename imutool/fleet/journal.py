@@ -90,7 +90,7 @@ class Journal:
                 self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  closed with the journal
                 self._pieces = _Pieces(self.path, self._file)
         except io_errors(out) as error:
-            raise ConfigError(f"cannot be written ({reason(error)})", where=self.path, fix="Choose another OUT") from error
+            raise ConfigError(f"cannot be written ({reason(error)})", where=out, expected="a folder as OUT") from error
         try:
             self._lock()
             known = self._read()

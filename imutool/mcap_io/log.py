@@ -69,6 +69,9 @@ class Log:
         self.topics = MappingProxyType(topics_of(self.index))
         self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, self.firsts, self.rows)})
 
+    def __repr__(self) -> str:
+        return f"<log {self.path}: {self.listing()}>"
+
     def __enter__(self) -> Log:
         return self
 
@@ -139,12 +142,13 @@ class Log:
         """
         if (parts := parse_parts(name)) is not None:
             return self._join(*(self.topic(part, (schemas.IMU, *schemas.VECTORS)) for part in parts))
+        fitting = " or ".join(topic.name for topic in self.with_schema(schema_names))
         if name not in self.topics:
-            raise LogError(f"there is no topic {name}", where=self.path, expected=self.listing())
+            raise LogError(f"there is no topic {name}", where=self.path, expected=fitting or self.listing())
         found = self.topics[name]
         if found.schema_name not in schema_names:
             what = f"{name} carries {found.schema_name or 'messages without schema'}"
-            raise LogError(what, where=self.path, expected=" or ".join(schema_names))
+            raise LogError(what, where=self.path, expected=fitting or " or ".join(schema_names))
         if not found.is_read:
             raise LogError(f"{name} is encoded as {found.message_encoding!r}", where=self.path, expected=" or ".join(ENCODINGS))
         return found

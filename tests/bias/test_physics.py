@@ -192,7 +192,7 @@ def test_a_file_that_says_nothing_sensible_is_refused(tmp_path: Path) -> None:
     (tmp_path / "odd.toml").write_text('[[effect]]\nname = "gyro_scal"\n[effect.parameters]\nx = {value = 0.1, unit = "-"}\n')
     with pytest.raises(ConfigError, match="gyro_scale"):
         find_model(tmp_path / "odd.toml", RATE_HZ)
-    with pytest.raises(ModelError, match="has no sample rate"):
+    with pytest.raises(ModelError, match="has no rate; expected a trained model"):
         find_model(tmp_path / "odd.toml")
 
 

@@ -638,7 +638,9 @@ def test_six_numbers_are_taken_as_they_are() -> None:
 )
 def test_other_words_are_refused_with_what_there_is(text: str) -> None:
     imu, _ = resting()
-    with pytest.raises(ConfigError, match=r"init: .*expected auto, stationary, prior, truth or gx,gy,gz,ax,ay,az"):
+    with pytest.raises(
+        ConfigError, match=r"init: .*expected auto, stationary, prior, truth, truth:SECONDS or gx,gy,gz,ax,ay,az"
+    ):
         find_initial_bias(text, static.Model(), Recording("r", imu))
 
 

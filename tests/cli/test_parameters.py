@@ -34,6 +34,11 @@ def test_the_page_of_help_lists_every_command_with_its_own_words(capsys: pytest.
     assert all(name in shown for name in own)
 
 
+def test_every_command_prints_more_or_less_as_it_is_asked_to() -> None:
+    own = {name: {p.name for p in command.params} for name, command in COMMANDS.items() if name != "fleet"}
+    assert [name for name, names in own.items() if not {"verbose", "quiet"} <= names] == []
+
+
 @pytest.mark.parametrize(
     ("command", "typed", "answer"),
     [
@@ -135,6 +140,7 @@ def test_a_method_and_a_setting_go_by_the_option_that_gave_them() -> None:
     flag_of = flags(COMMANDS["train"])
     assert error_with_flags(ConfigError("'liner' is not known", where="bias"), flag_of).where == "--method"
     assert error_with_flags(ConfigError("stps is not a setting", where="settings"), flag_of).where == "--set"
+    assert error_with_flags(ConfigError("is 'x'", where="settings: model.loads"), flag_of).where == "--set: model.loads"
 
 
 @pytest.mark.parametrize(("verb", "name"), [("debias", "init"), ("evaluate", "html"), ("info", "json")])

@@ -61,6 +61,8 @@ def test_evaluate_writes_the_numbers_of_its_table(logs: Path, tmp_path: Path, mo
     done = run("evaluate", logs / "flight_2.mcap", *words)
     assert done.exit_code == 0, done.output
     assert "Report: page.html" in done.stdout
+    whole, drift = done.stdout.split("\n\n")[:2]
+    assert ("aided" in whole, "expected" in drift, "aided" in drift) == (True, True, False)  # the windows use no aids
     page = (tmp_path / "page.html").read_text()
     results = json.loads((tmp_path / "said.json").read_text())["results"]
     drawn = [one for one in results if (one["model"], one["estimate"]) != ("raw", "aided")]

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
 from imutool.converters import _table_mat, table
-from imutool.errors import DataError
+from imutool.converters._table_map import read_map
+from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.sensor.made_up_flight import flight
@@ -681,3 +682,11 @@ def test_times_of_parquet_may_be_texts_or_times_of_the_day(tmp_path, kind):
     (sequence,) = table.sequences(tmp_path / "log.parquet")
     imu = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"}).imus["/imu0"]
     np.testing.assert_array_equal(imu.t_ns, (t_us + day) * 1000)
+
+
+def test_numbers_of_a_map_may_be_a_text_as_names_may() -> None:
+    units = {"gyro_unit": "rad/s", "accel_unit": "g"}
+    assert read_map({**units, "accel_offset": "510, -1,2.5"})["accel_offset"] == [510.0, -1.0, 2.5]
+    for name, value, expected in (("accel_offset", "a,b,c", "numbers"), ("gyro", 3, "names of columns"), ("time", 1.5, "text")):
+        with pytest.raises(ConfigError, match=f"mapping: {name} is .*; expected {expected}"):
+            read_map({**units, name: value})

@@ -48,6 +48,12 @@ def test_what_was_finished_is_known_to_the_next_run(tmp_path: Path) -> None:
         assert journal.done("a") == result("a", messages=8)
 
 
+def test_a_file_is_no_folder_of_a_fleet(tmp_path: Path) -> None:
+    (out := tmp_path / "out").touch()
+    with pytest.raises(ConfigError, match=f"^{re.escape(str(out))}: cannot be written .*; expected a folder as OUT"):
+        fill(out, "a")
+
+
 def test_a_full_disk_is_told_with_the_journal_and_what_to_do(tmp_path: Path) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     told = re.escape(f"{tmp_path / NAME}: cannot be written (File too large). Make room, and go on with `resume`")

@@ -485,13 +485,13 @@ def test_several_imus_are_listed(foreign: Foreign, make: Make) -> None:
 
 def test_a_topic_that_is_not_there_or_is_something_else_is_refused(foreign: Foreign, make: Make) -> None:
     path = foreign(imu_messages(make) + poses(make, "/mocap"))
-    with pytest.raises(LogError, match=r"no topic /imu9; expected /imu \(sensor_msgs/msg/Imu\), /mocap"):
+    with pytest.raises(LogError, match=r"no topic /imu9; expected /imu\.?$"):
         read(path, imu="/imu9")
-    with pytest.raises(LogError, match="/mocap carries geometry_msgs/msg/PoseStamped"):
+    with pytest.raises(LogError, match=r"/mocap carries geometry_msgs/msg/PoseStamped; expected /imu\.?$"):
         read(path, imu="/mocap")
     with pytest.raises(LogError, match="no poses on /truth; expected /mocap"):
         read(path, truth="/truth")
-    with pytest.raises(LogError, match="/imu carries"):
+    with pytest.raises(LogError, match=r"/imu carries sensor_msgs/msg/Imu; expected /mocap\.?$"):
         read(path, truth="/imu")
     with Log(path) as log, pytest.raises(LogError, match="no topic /x"):
         next(log.stamps("/x"))

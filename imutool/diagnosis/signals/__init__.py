@@ -34,7 +34,7 @@ def check_signals(asked: ComparedLogs) -> None:
         LogError: a log has no such field.
     """
     if asked.signals and (asked.sim is None or len(asked.reals) != 1):
-        raise ConfigError("`signals` compare one recording with its simulation", where="signals", fix="Give one log and `sim`")
+        raise ConfigError("needs one recording and its simulation", where="signals", fix="Give one log and `sim`")
     for name, place in product(asked.signals, (asked.reals[0], asked.sim)):
         if place is not None:
             read_field(place, name)

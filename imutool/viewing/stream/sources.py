@@ -93,16 +93,16 @@ def _replay(name: str, imu: str | None, speed: float, temperature: str | None) -
     from imutool.mcap_io.log import Log
 
     log = Log(to_location(name))
-    topics = log.imu_topics
-    if imu is None and len(topics) != 1:
+    try:
+        topic = imu or log.only_imu()
+    except LogError:
         log.close()
-        raise LogError(f"the log has {len(topics)} IMUs", where=name, expected="one", fix="Choose one with `imu`")
+        raise
 
     def samples() -> Generator[Sample | None]:
         with log:
             yield None
             due_s, last_ns = time.perf_counter(), None
-            topic = imu or topics[0]
             found = None if temperature is None else channel_of(temperatures(log), topic, temperature)
             for batch in raw_batches(log, topic):
                 warm = _arriving(batch.stamp_ns, last_ns, None if found is None else found[1])
@@ -164,7 +164,7 @@ def _udp(host: str, port: int, malformed: Malformed) -> Samples:
     except OSError as error:
         line.close()
         raise ConfigError(
-            f"cannot be bound ({error.strerror})", where=f"udp://{host}:{port}", fix="Choose another port"
+            f"cannot be bound ({error.strerror})", where=f"udp://{host}:{port}", fix="Choose another host or port"
         ) from error
     line.settimeout(WAIT_S)
 
