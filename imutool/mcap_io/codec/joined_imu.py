@@ -18,7 +18,10 @@ from imutool.mcap_io.codec.schemas import ACCELS, VECTOR3
 
 SENSOR_WORDS = r"gyro(scope)?", r"accel(erometer)?"
 JOIN_VECTORS = "; imutool debias and others read a gyro's and an accelerometer's vectors as one: --imu gyro=TOPIC,accel=TOPIC"
-READ, IDL = {"cdr", "ros1", "protobuf", "json", "flatbuffer"}, {"ros2idl", "omgidl"}  # encodings; languages of definitions
+READ, IDL = (
+    {"cdr", "ros1", "protobuf", "json", "msgpack", "flatbuffer"},
+    {"ros2idl", "omgidl"},
+)  # encodings; languages of definitions
 Cut = Iterator[tuple[Shaped[np.ndarray, " n"], UInt8[np.ndarray, "n L"]]]  # heads and payloads of equal size
 
 
