@@ -31,7 +31,7 @@ from ._table_units import TIME_NS
 from ._table_wraps import begun_anew
 
 MAX_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
-SENSOR_TIME = r"(sensor|event|hardware|hw)_?(event_?)?(time|t_|ts|stamp)"  # Android's, in addition to the time of the program
+SENSOR_TIME = r"(.*_)?(sensor|event|hardware|hw|device|imu)_?(event_?)?(time|t_|ts|stamp)"  # next to the time of the program
 
 
 def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns: Columns, given: Entries) -> None:
