@@ -1028,3 +1028,18 @@ def test_a_folder_of_matlab_mobile_is_a_recording(tmp_path):
     np.testing.assert_allclose(imu.gyro, 0.01 * COUNTS)
     np.testing.assert_allclose(imu.accel, 9.81 * ACCEL_G)
     assert imu.t_ns[0] == 1_764_499_980_000_000_000  # UTC, as no zone is stated
+
+
+def test_the_minus_of_typography_is_one(tmp_path):
+    """Programs write it in the numbers of Sweden, Norway and Finland."""
+    path = write_csv(
+        tmp_path / "imu.csv", ["time [s]", *NAMES[1:4], *(f"g{a} [deg/s]" for a in "xyz")], [T_S, *ACCEL_G.T, *COUNTS.T]
+    )
+    path.write_text(path.read_text().replace("-", "\N{MINUS SIGN}"), encoding="utf-8")
+    np.testing.assert_allclose(read(path).imus["/imu0"].gyro, np.deg2rad(COUNTS))
+
+
+def test_a_temperature_that_rises_is_no_time_next_to_one(tmp_path):
+    names = ["T", "Time", *NAMES[1:4], *(f"g{a} [deg/s]" for a in "xyz")]
+    log = read(write_csv(tmp_path / "imu.csv", names, [20.0 + 0.005 * np.arange(COUNT), T_S, *ACCEL_G.T, *COUNTS.T]))
+    assert np.array_equal(log.imus["/imu0"].t_ns, np.round(1e9 * T_S))
