@@ -48,7 +48,7 @@ LAYOUTS: list[tuple[str, Entries, Entries]] = [  # what is said of the data set,
 
 
 def state_units(columns: Columns) -> None:
-    """Enter the units of a table as Kalibr's `kalibr_bagcreater` reads it: its header names none."""
+    """Enter the units of a table for `kalibr_bagcreater`, whose header names none."""
     units = {c: unit for c in columns.values for name, unit in KALIBR.items() if re.fullmatch(name, split_name(c)[0])}
     if len(units) == 6 and not any(columns.units.get(column) for column in units):
         columns.units |= units
