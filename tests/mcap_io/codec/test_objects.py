@@ -90,6 +90,11 @@ def test_stamps_that_are_text_are_stamps(tmp_path: Path, stamped: dict[str, Any]
     assert np.array_equal(imu.gyro, GYRO)
 
 
+def test_whole_seconds_are_no_stamps(tmp_path: Path) -> None:
+    imu = read(write(tmp_path / "in.mcap", {"timestamp": lambda t_ns: iso(t_ns)[:19] + "Z"})).imu
+    assert (np.abs(imu.t_ns - T_NS) < 4_000_000).all()  # the log times
+
+
 @pytest.mark.parametrize("encoding", PACK)
 def test_the_debiased_messages_have_stamps_and_numbers_as_their_source(tmp_path: Path, encoding: str) -> None:
     path = write(tmp_path / "in.mcap", {"timestamp": iso, "t_ns": str}, encoding, text=str)

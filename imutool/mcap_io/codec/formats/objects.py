@@ -29,6 +29,7 @@ from imutool.mcap_io.codec.formats import (
 from imutool.mcap_io.codec.schemas import NS_PER_S
 
 DATE_TIME = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9})\d*)?(Z|[+-]\d\d:?\d\d)?")
+FRACTION_OF_S = re.compile(r":\d\d[.,]\d")
 DIGITS = re.compile(r"[+-]?\d{1,20}")
 FRACTION = re.compile(r"[+-]?(\d{1,20}(\.\d*)?|\.\d+)(e[+-]?\d{1,2})?", re.IGNORECASE)
 IDENTITY = re.compile(r".*(frame|name|id)", re.IGNORECASE)  # fields whose text is no number, whatever it consists of
@@ -135,6 +136,8 @@ class Json:
     def _tree(self, value: Any, path: Path) -> Any:
         if isinstance(value, str):
             kind = _kind(str(path[-1]), value) if path else TEXT
+            if kind == TIME and not FRACTION_OF_S.search(value):  # which many samples share
+                return TEXT
             if kind != TEXT:
                 self._texts[path] = kind
             return kind
