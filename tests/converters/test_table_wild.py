@@ -1043,3 +1043,13 @@ def test_a_temperature_that_rises_is_no_time_next_to_one(tmp_path):
     names = ["T", "Time", *NAMES[1:4], *(f"g{a} [deg/s]" for a in "xyz")]
     log = read(write_csv(tmp_path / "imu.csv", names, [20.0 + 0.005 * np.arange(COUNT), T_S, *ACCEL_G.T, *COUNTS.T]))
     assert np.array_equal(log.imus["/imu0"].t_ns, np.round(1e9 * T_S))
+
+
+def test_imus_of_one_table_share_the_unit_that_one_shows(tmp_path):
+    axes = [f"{side}_{sensor}_{axis}" for side in ("left", "Right") for sensor in ("gyr", "acc") for axis in "xyz"]
+    shows, hides = COUNTS / 131, RNG.normal(0.0, 0.1, (COUNT, 3))
+    path = write_csv(tmp_path / "two.csv", ["time [s]", *axes], [T_S, *shows.T, *ACCEL_G.T, *hides.T, *ACCEL_G.T])
+    imus = read(path).imus
+    np.testing.assert_allclose(imus["/right/imu"].gyro, np.deg2rad(hides))
+    with pytest.raises(ConfigError, match="state no unit of the gyro"):
+        read(write_csv(tmp_path / "one.csv", ["time [s]", *axes[6:]], [T_S, *hides.T, *ACCEL_G.T]))
