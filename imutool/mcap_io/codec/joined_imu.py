@@ -102,7 +102,7 @@ def no_imu_fix(topics: Iterable[tuple[str, str, str]]) -> str:
 
 
 def unread_fix(encodings: Set[str], languages: Set[str]) -> str:
-    """Hint at messages in which no IMU is looked for, or found by the names of fields; may be empty."""
+    """Hint at how messages of these encodings are searched for an IMU; may be empty."""
     if unread := sorted((encodings - READ) | (languages & IDL)):
         what = f"Messages in {' and '.join(unread)} are not searched for an IMU"
         return f"{what}: record them as messages of ROS, protobuf or JSON"
