@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from io import BytesIO
+from pathlib import Path
 from struct import Struct
 from typing import Any, BinaryIO
 
@@ -20,9 +21,8 @@ MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = 9  # bytes of a record ahead of its content: opcode and length
 RECORD, MESSAGE_HEAD = Struct("<BQ"), Struct("<HIQQ")  # a message: channel, sequence, log and publish times
 TIME, CRC_AT = Struct("<Q"), 24  # first in a chunk's content, and where in it its CRC is
-ATTACHMENT_HEAD = Struct("<QQI")  # two times, and bytes of the name
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = 2, 3, 4, 5, 6, 9, 12, 15  # opcodes; none is larger
-MAX_NAMED = 10  # attachments or entries, in a loss
+MAX_NAMED = 10  # entries, in a loss
 RUN_BYTES = 1 << 20  # messages outside chunks are read in runs of about this size
 WRITTEN_OVER = ("rosbag2", "imutool")  # metadata whose writers write a newer record behind the one that it replaces
 _Waiting = tuple[int, int, int, int, int, bytes]  # log time, place of its chunk, number in it, channel, publish time, content
@@ -78,6 +78,7 @@ class Content:
     Attributes:
         blocks: first log time, place and bytes of each run of messages outside chunks; of each chunk, with 0 bytes.
         metadata: metadata by name.
+        attachments: place and bytes of each attachment's record.
         losses, notes: what of it a converted log lacks, and what nothing checks.
 
     Raises:
@@ -87,22 +88,23 @@ class Content:
     def __init__(self, summary: Any, file: BinaryIO) -> None:
         self.blocks: list[tuple[int, int, int]] = []
         self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments: list[tuple[int, int]] = []
         self._file, self._unchecked, self._outside, self._stated = file, 0, 0, 0
-        self._attachments, self._replaced, others = Counter[str](), Counter[str](), Counter[int]()
+        self._replaced, others = Counter[str](), Counter[int]()
         take = {
             CHUNK: self._take_chunk,
             MESSAGE: self._take_message,
             METADATA: self._take_metadata,
-            ATTACHMENT: self._take_attachment,
             DATA_END: self._take_end,
         }
         for opcode, at, size in records(file, summary):
             if opcode in take:
                 take[opcode](at, size)
+            elif opcode == ATTACHMENT:
+                self.attachments.append((at, size))
             elif opcode > DATA_END:
                 others[opcode] += 1
         losses = {
-            "attachments are not carried over": _first_of(self._attachments),
             "records that are none of MCAP's own are not carried over": listed(others),
             "metadata of one name are joined, and later values replace others": _first_of(self._replaced),
         }
@@ -136,10 +138,6 @@ class Content:
             self._replaced.update(f"{key} of {record.name}" for key in new if new[key] != known.get(key, new[key]))
         known.update(new)
 
-    def _take_attachment(self, at: int, size: int) -> None:
-        _, _, length = ATTACHMENT_HEAD.unpack(self._file.read(ATTACHMENT_HEAD.size))
-        self._attachments[self._file.read(min(length, size)).decode(errors="replace")] += 1
-
     def _take_end(self, at: int, size: int) -> None:
         self._stated = int.from_bytes(self._file.read(4), "little")
         if self._stated and self._outside and self._stated != _crc(self._file, at):
@@ -165,6 +163,20 @@ def records(file: BinaryIO, summary: Any, end: int | None = None) -> Iterator[tu
             raise ValueError(f"the record at byte {at} is none, or crosses the end")
         yield opcode, at, size
         at += size + (listed.get(at, 0) if opcode == CHUNK else 0)
+
+
+def whole_size(path: Path) -> int:
+    """Bytes of a log up to the end of its last whole record."""
+    size, at = path.stat().st_size, len(MAGIC)
+    with path.open("rb") as file:
+        file.seek(at)
+        while len(record := file.read(RECORD_HEAD)) == RECORD_HEAD:
+            following = at + RECORD_HEAD + int.from_bytes(record[1:], "little")
+            if following > size:
+                break
+            at = following
+            file.seek(at)
+    return at
 
 
 def _first_of(counts: Mapping[str, int]) -> str:

@@ -31,7 +31,7 @@ from ._table_units import TIME_NS
 from ._table_wraps import begun_anew
 
 MAX_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
-SENSOR_TIME = r"(sensor|event|hardware|hw)_?(event_?)?(time|t_|ts|stamp)"  # Android's, in addition to the time of the program
+SENSOR_TIME = r"(.*_)?(sensor|event|hardware|hw|device|imu)_?(event_?)?(time|t_|ts|stamp)"  # next to the time of the program
 
 
 def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns: Columns, given: Entries) -> None:
@@ -52,6 +52,7 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
     others = [c for c in found if length not in (None, len(columns.values[c])) and rises(columns.values[c])]
     found = [c for c in found if length in (None, len(columns.values[c]))]
     still, found = [c for c in found if not goes_on(columns.values[c])], [c for c in found if goes_on(columns.values[c])]
+    found.sort(key=lambda c: names[c][0] == "t")  # next to a longer name it may be a temperature, which rises too
     found.sort(key=lambda c: in_batches(columns.values[c]))
     if gyro:
         found.sort(key=lambda c: (_table_of(c) != _table_of(gyro[0]), -shared_group(c, gyro[0])))

@@ -18,6 +18,7 @@ from ._table_echo import long_table, of_echo, of_long
 from ._table_hdf5 import load_hdf5, names_of_hdf5
 from ._table_headerless import as_table, name_headerless
 from ._table_json import is_json, load_json
+from ._table_layouts import state_units
 from ._table_mat import check_size, load_mat, names_of_mat
 from ._table_merged import join_calendar, join_milliseconds, join_stamps, settle_zones, sort_by_clock
 from ._table_mocap import is_mocap, read_mocap
@@ -91,6 +92,7 @@ def load(path: Path, kind: str) -> Columns:
     settle_zones(columns)
     sort_by_clock(columns)
     fill_own_times(columns)
+    state_units(columns)
     add_gravity(columns)
     if not columns.values:
         why = "".join(f"; {loss}" for loss in columns.remarks.losses[:1])

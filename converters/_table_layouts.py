@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+
 from ._table_map import Entries, Proposal
+from ._table_names import split_name
 from ._table_text import Columns
 
 RONIN: Entries = {  # HDF5 of the RoNIN data set; what Android has not corrected itself shows the bias
@@ -31,6 +34,7 @@ BLACKBIRD_POSES: Entries = {  # by motion capture: x y z qx qy qz qw
     "quaternion_wxyz": [f"traj_target[{axis}]" for axis in (6, 3, 4, 5)],
     "pose_kind": "truth",
 }
+KALIBR = {"omega_[xyz]": "rad/s", "alpha_[xyz]": "m/s^2"}  # names of rates and accelerations
 COLUMN_ENTRIES = "time", "gyro", "accel", "position", "quaternion_wxyz"
 LAYOUTS: list[tuple[str, Entries, Entries]] = [  # what is said of the data set, its IMU, and its poses if there
     ("its arrays are those of RoNIN", RONIN, RONIN_POSES),
@@ -41,6 +45,13 @@ LAYOUTS: list[tuple[str, Entries, Entries]] = [  # what is said of the data set,
     ),
     ("its arrays are those of Blackbird for learned inertial odometry", {**BLACKBIRD, **BLACKBIRD_POSES}, {}),
 ]
+
+
+def state_units(columns: Columns) -> None:
+    """Enter the units of a table for `kalibr_bagcreater`, whose header names none."""
+    units = {c: unit for c in columns.values for name, unit in KALIBR.items() if re.fullmatch(name, split_name(c)[0])}
+    if len(units) == 6 and not any(columns.units.get(column) for column in units):
+        columns.units |= units
 
 
 def known_layout(columns: Columns) -> Proposal | None:

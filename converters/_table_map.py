@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -240,21 +240,24 @@ class Proposal(msgspec.Struct):
         return "\n".join(lines)
 
 
-def share_units(proposals: Iterable[Proposal]) -> None:
+def share_units(proposals: Mapping[str, Proposal]) -> None:
     """Enter an open unit of the gyro that other IMUs with columns of the same names have."""
     found: dict[tuple[str, ...], set[str]] = {}
-    for proposal in proposals:
+    for topic, proposal in proposals.items():
         if "gyro_unit" not in proposal.open and "gyro_unit" in proposal.entries:
-            found.setdefault(_leaves(proposal), set()).add(str(proposal.entries["gyro_unit"]))
-    for proposal in proposals:
-        if proposal.open == ["gyro_unit"] and len(units := found.get(_leaves(proposal), set())) == 1:
+            found.setdefault(_leaves(topic, proposal), set()).add(str(proposal.entries["gyro_unit"]))
+    for topic, proposal in proposals.items():
+        if proposal.open == ["gyro_unit"] and len(units := found.get(_leaves(topic, proposal), set())) == 1:
             (unit,) = units
             proposal.settle_unit("gyro", unit, f"the other IMUs, whose columns have the same names, are in {unit}")
 
 
-def _leaves(proposal: Proposal) -> tuple[str, ...]:
-    """Names of an IMU's columns without their groups."""
-    return tuple(name.rpartition("/")[2] for name in (*proposal.entries.get("gyro", []), *proposal.entries.get("accel", [])))
+def _leaves(topic: str, proposal: Proposal) -> tuple[str, ...]:
+    """Names of an IMU's columns without their groups and the IMU's own: of `left_gyr_x` on `/left/imu` `_gyr_x`."""
+    names = (
+        name.rpartition("/")[2].lower() for name in (*proposal.entries.get("gyro", []), *proposal.entries.get("accel", []))
+    )
+    return tuple(name.replace(topic.split("/")[1], "", 1) for name in names)
 
 
 def column_named(columns: Columns, wanted: str, where: Path | str) -> np.ndarray:

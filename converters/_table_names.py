@@ -90,9 +90,9 @@ FORMS = (  # names of an axis, by falling preference; one of roll, pitch and yaw
     rf"(?P<sensor>(?:.*_)?(WORDS))(?P<state>{STATES})_?(?P<axis>[xyz012])",  # acc_raw_x
     rf"(?P<sensor>(?:.*_)?(?=[a-z]{{2}})(WORDS)){STATE}_(?P<nth>[1-9])",  # acc_1, as MATLAB names the columns of a matrix
 )
-SYMBOLS = {  # of an aircraft; specific force, or in the axes of the body, where gravity shows that it is no bias
+SYMBOLS = {  # of an aircraft and of Kalibr; specific force, or in the axes of the body, where gravity shows that it is no bias
     "gyro": r"(?P<sensor>)(?P<axis>[pqr])",
-    "accel": r"(?P<sensor>f|(.*_)?acc(el(eration)?)?_b(ody)?)_?(?P<axis>[xyz])",
+    "accel": r"(?P<sensor>f|alpha|(.*_)?acc(el(eration)?)?_b(ody)?)_?(?P<axis>[xyz])",
 }
 NUMBERED = r"([ _-]?(id|no|nr|num(ber)?|index|idx|name|code|label))?"
 RECORDINGS = (  # columns whose values tell recordings apart

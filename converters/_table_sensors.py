@@ -21,7 +21,7 @@ from ._table_text import COMMENTS, Columns, read_csv
 from ._table_times import in_batches, rises
 
 SENSORS = {  # words in the names of files and of sensors
-    "gyro": r"gyrm?|gyros?|gyroscopes?|gyroskop|giroscopio|giroscopo",
+    "gyro": r"gyrm?|gyros?|gyroscopes?|gyroskop|giroscopio|giroscopo|angularvelocity|rotationrate",
     "accel": r"acc[elm]?|accels?|accelerometers?|accelerations?|acelerometro|accelerometre|beschleunigung(ssensor)?",
 }
 OTHERS = r"bias|biases|calib|calibration|linear|linea[lr]|user|gravity|noise|allan|stride|labels?"
@@ -48,6 +48,7 @@ def sensors_among(names: Iterable[str]) -> dict[str, str]:
     found: dict[str, list[tuple[bool, str]]] = {}
     for name in names:
         words = [word.lower() for word in re.findall(WORD, name)]
+        words = [*words, *map("".join, pairwise(words))]  # AngularVelocity, of MATLAB Mobile
         for sensor, pattern in SENSORS.items():
             if any(re.fullmatch(pattern, word) for word in words) and not any(re.fullmatch(OTHERS, word) for word in words):
                 found.setdefault(sensor, []).append((any(re.fullmatch(UNCORRECTED, word) for word in words), name))

@@ -128,8 +128,8 @@ class Columns:
 
 
 def text_of(raw: bytes) -> str:
-    """Text in UTF-8 or UTF-16, else in the code page of Western Windows, with lines as on Unix."""
-    return _with_arrivals(_decoded(raw).replace("\r\n", "\n").replace("\r", "\n"))
+    """Text in UTF-8, UTF-16 or the code page of Western Windows; lines and minus as in ASCII."""
+    return _with_arrivals(_decoded(raw).replace("\r\n", "\n").replace("\r", "\n").replace("\u2212", "-"))
 
 
 def _decoded(raw: bytes) -> str:

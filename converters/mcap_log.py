@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from imutool.errors import DataError
-from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
+from imutool.recording.message_log import Attachment, Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._mcap_chunks import MAGIC, RECORD_HEAD, Content, content, in_order, listed, records, summary_of
+from ._mcap_chunks import ATTACHMENT, MAGIC, Content, content, in_order, listed, records, summary_of, whole_size
 from ._ros_types import plain_cdr
 from ._source import find_files, find_folders, head, name, with_suffix
 
@@ -70,7 +70,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, define: Define = a
         return read_parts(sequence, paths, Remarks([note]), images=images, define=define)
     with _refusing(sequence.path), sequence.path.open("rb") as file:
         summary = summary_of(_reader(file), file)
-        content = Content(summary, file)
+        found = Content(summary, file)
         of_channel = summary.statistics.channel_message_counts if summary.statistics is not None else {}
         counts: dict[str, int] = {}
         channels = [(summary.schemas.get(channel.schema_id), channel) for channel in summary.channels.values()]
@@ -83,15 +83,16 @@ def read_sequence(sequence: Sequence, *, images: bool = True, define: Define = a
                 topics.append(define(_topic(schema, channel)))
                 silent.discard(channel.topic)
         left_out = f"topics without messages are left out: {', '.join(sorted(silent))}"
-        remarks = Remarks([*content.notes, *[left_out][: len(silent)]], content.losses)
-        own = {**content.metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
+        remarks = Remarks([*found.notes, *[left_out][: len(silent)]], found.losses)
+        own = {**found.metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
     return MessageLog(
         sequence.name,
         sequence.path.name,
         topics=tuple(topics),
         messages=partial(_messages, sequence.path, images, define, remarks),
         counts=counts,
-        metadata={"imutool": own, **content.metadata},
+        metadata={"imutool": own, **found.metadata},
+        attachments=tuple(Attachment(sequence.path, at, size) for at, size in found.attachments),
         remarks=remarks,
     )
 
@@ -192,7 +193,7 @@ def read_parts(sequence: Sequence, paths: list[Path], remarks: Remarks, *, image
     counts = Counter[str]()
     topics: dict[str, MessageTopic] = {}
     metadata: dict[str, dict[str, str]] = {}
-    sources = []
+    sources, attachments = [], list[Attachment]()
     for path in paths:
         if is_finished(path):
             part = read_sequence(Sequence(path.stem, path), images=images, define=define)
@@ -201,12 +202,14 @@ def read_parts(sequence: Sequence, paths: list[Path], remarks: Remarks, *, image
             counts.update(part.counts)
             for name, values in part.metadata.items():
                 metadata.setdefault(name, {}).update(values)
+            attachments += part.attachments
             found, messages = part.topics, partial(_messages, path, images, define, remarks)
         else:
             messages = partial(_unfinished, path, images)
+            attachments += _unlisted(path)
             found = tuple(dict.fromkeys(message.topic for message in messages()))
             what = f"{path.name} was not finished: it is read up to its last whole chunk, at byte"
-            remarks.losses.append(f"{what} {_whole_size(path)} of {path.stat().st_size}")
+            remarks.losses.append(f"{what} {whole_size(path)} of {path.stat().st_size}")
         topics |= {topic.name: topic for topic in found if topic.message_encoding == "cdr"} | topics
         sources.append(messages)
     return MessageLog(
@@ -216,22 +219,18 @@ def read_parts(sequence: Sequence, paths: list[Path], remarks: Remarks, *, image
         messages=lambda: chain.from_iterable(messages() for messages in sources),
         counts=counts,
         metadata=metadata | {"imutool": {"format": "mcap_log", "sequence": sequence.name}},
+        attachments=tuple(attachments),
         remarks=remarks,
     )
 
 
-def _whole_size(path: Path) -> int:
-    """Bytes of a log up to the end of its last whole record."""
-    size, at = path.stat().st_size, len(MAGIC)
-    with path.open("rb") as file:
-        file.seek(at)
-        while len(record := file.read(RECORD_HEAD)) == RECORD_HEAD:
-            following = at + RECORD_HEAD + int.from_bytes(record[1:], "little")
-            if following > size:
-                break
-            at = following
-            file.seek(at)
-    return at
+def _unlisted(path: Path) -> Iterator[Attachment]:
+    """Attachments of a log without an end."""
+    from mcap.summary import Summary
+
+    with _refusing(path), path.open("rb") as file:
+        found = [*records(file, Summary(), whole_size(path))]
+    yield from (Attachment(path, at, size) for opcode, at, size in found if opcode == ATTACHMENT)
 
 
 def _unfinished(path: Path, images: bool) -> Iterator[Message]:
@@ -242,7 +241,7 @@ def _unfinished(path: Path, images: bool) -> Iterator[Message]:
 
     schemas: dict[int, Any] = {}
     topics: dict[int, MessageTopic] = {}
-    end = _whole_size(path)
+    end = whole_size(path)
     with _refusing(path), path.open("rb") as file:
         for place in records(file, Summary(), end):
             for part in sorted(content(file, *place), key=lambda part: part.log_time if isinstance(part, Record) else -1):

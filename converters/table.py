@@ -128,7 +128,7 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks, given: Entries) ->
     """
     separate = {} if known_layout(columns) or given.keys() & {"gyro", "accel"} else imus_apart(columns)
     proposals = {topic: _proposal(part, given) for topic, part in (separate or {IMU_TOPIC: columns}).items()}
-    share_units(proposals.values())
+    share_units(proposals)
     proposals = without_copies(proposals, columns)
     own_times = len({str(proposal.entries.get("time", "")) for proposal in proposals.values()}) > 1
     maps = []

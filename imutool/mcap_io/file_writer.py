@@ -29,9 +29,11 @@ import imutool
 from imutool.array_types import Int64, UInt16
 from imutool.errors import DataError
 from imutool.file_location import Location
+from imutool.mcap_io.blocks import Attachment
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec import schemas as schema
-from imutool.mcap_io.codec.records import FOOTER_SIZE, MAGIC
+from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC
+from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.storage.target import Target
 from imutool.recording.message_log import MessageTopic
 
@@ -215,6 +217,13 @@ class LogWriter:
         raw = records.build(Metadata(name=name, metadata=texts))
         self.contents.metadata.append(MetadataIndex(offset=self.target.position, length=len(raw), name=name))
         self.target.write(raw)
+
+    def attachment(self, source: Source, offset: int, length: int) -> None:
+        """Copies an attachment's record from another log; LogError of a damaged one."""
+        found = Attachment.of(source, offset, length - HEAD.size)
+        found.check_crc(source)
+        self.contents.attachments.append(found.index_at(self.target.position))
+        self.target.copy(source, offset, offset + length)
 
     def chunk(self, chunk: Chunk, compression: str | None = None) -> None:
         """Writes messages as one chunk, with their message indexes."""

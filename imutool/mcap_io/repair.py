@@ -241,9 +241,8 @@ class _Saver:
             name = records.parse(Metadata, body, span.offset).name
             self.out.contents.metadata.append(MetadataIndex(offset=at, length=span.length, name=name))
         elif span.opcode == Opcode.ATTACHMENT:
-            attachment = Attachment.of(self.source, span.offset, span.length - HEAD.size)
-            attachment.check_crc(self.source)
-            self.out.contents.attachments.append(attachment.index_at(at))
+            self.out.attachment(self.source, span.offset, span.length)
+            return
         self.out.target.copy(self.source, span.offset, span.offset + span.length)
 
 

@@ -25,6 +25,7 @@ from imutool.mcap_io.codec.decode import (
     decode_twist,
     named,
 )
+from imutool.mcap_io.codec.formats.objects import OF_OBJECTS
 from imutool.mcap_io.codec.joined_imu import JoinedImu, Vectors, whole_of
 from imutool.mcap_io.codec.messages import Messages, Rows
 from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
@@ -34,7 +35,7 @@ from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import computed_kind, named_kind
 
 ENCODINGS, DESCRIBED = ("cdr", "ros1"), {("ros2msg", "cdr"), ("ros1msg", "ros1")}
-REFLECTED = ("protobuf", "json", "flatbuffer")  # encodings whose messages are searched for those of an IMU and for poses
+REFLECTED = ("protobuf", "flatbuffer", *OF_OBJECTS)  # encodings whose messages are searched for those of an IMU and for poses
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
 PART_KEY = "imutool_part_of"  # channel metadata: one sensor of the IMU on that topic
 RECORDED_KEY = "imutool_recorded_as"  # channel metadata: the original of the IMU on that topic
@@ -208,9 +209,12 @@ def reflected_topics(
     lists = {name: listed_poses(definitions[name], topic.message_encoding, topic.pose_kind) for name, topic in topics.items()}
     found = {name: _as_ros(topics[name], poses) for name, poses in lists.items() if poses is not None}
     reflected = {n: t for n, t in topics.items() if t.message_encoding in REFLECTED and RECORDED_KEY not in t.metadata}
-    in_json = [name for name, topic in reflected.items() if topic.message_encoding == "json"]
+    of_objects = [name for name, topic in reflected.items() if topic.message_encoding in OF_OBJECTS]
     texts_of = {name: definition.data if (definition := definitions[name]) else b"" for name in reflected}
-    by_first = {name: reflect("json", name, topics[name].schema_name, texts_of[name], raw) for name, raw in firsts(in_json)}
+    by_first = {
+        name: reflect(topics[name].message_encoding, name, topics[name].schema_name, texts_of[name], raw)
+        for name, raw in firsts(of_objects)
+    }
     for name, topic in reflected.items():
         try:
             message = by_first.get(name) or reflect(topic.message_encoding, name, topic.schema_name, texts_of[name], None)

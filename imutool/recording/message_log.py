@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -54,6 +55,14 @@ class Message(NamedTuple):
     log_time: int
     publish_time: int
     payload: bytes | memoryview
+
+
+class Attachment(NamedTuple):
+    """Attachment record of an MCAP log, where its bytes lie: the data may be larger than memory."""
+
+    path: Path
+    offset: int  # of the record
+    length: int  # of the whole record
 
 
 @dataclass(frozen=True)
@@ -134,4 +143,5 @@ class MessageLog:
     kinds: Mapping[str, str] = field(default_factory=dict)
     pairs: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # IMU topic: topics of its gyro and accelerometer
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    attachments: tuple[Attachment, ...] = ()
     remarks: Remarks = field(default_factory=Remarks)

@@ -23,7 +23,7 @@ from imutool.api.logs import convert as convert_logs
 from imutool.converters import mcap_log
 from imutool.errors import DataError
 from imutool.mcap_io.codec import records
-from imutool.mcap_io.codec.flatbuffer import FlatBuffer
+from imutool.mcap_io.codec.formats.flatbuffer import FlatBuffer
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write

@@ -72,13 +72,27 @@ def test_two_sensors_are_joined_without_statistics(convert, tmp_path, options):
 
 
 @pytest.mark.parametrize("options", [{}, {"index_types": IndexType.CHUNK}, NO_INDEX])
-def test_metadata_of_one_name_are_kept_and_attachments_are_a_loss(convert, tmp_path, options):
+def test_metadata_of_one_name_and_attachments_are_kept(convert, tmp_path, options):
+    """Attachments were left out, and the exit code was 3."""
     done = convert(write_log(tmp_path / "in.mcap", beside=True, **options), tmp_path / "out.mcap")
-    assert done.returncode == 3
-    assert "attachments are not carried over: calibration.yaml" in done.stderr
+    assert done.returncode == 0, done.stderr
     with (tmp_path / "out.mcap").open("rb") as file:
         found = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
+        file.seek(0)
+        (attached,) = make_reader(file).iter_attachments()
     assert found["rig"] == {"camera": "left", "mount": "roof"}
+    assert (attached.name, attached.media_type, attached.data) == ("calibration.yaml", "text/yaml", b"gain: 1")
+    assert attached.log_time == attached.create_time == T_NS[0]
+    with Log(tmp_path / "out.mcap") as log:
+        log.check()
+
+
+def test_a_damaged_attachment_is_refused(convert, tmp_path):
+    source = write_log(tmp_path / "in.mcap", beside=True)
+    source.write_bytes(source.read_bytes().replace(b"gain: 1", b"gain: 2"))
+    done = convert(source, tmp_path / "out.mcap")
+    assert done.returncode == 5
+    assert "the attachment at byte" in done.stderr
 
 
 def _append(path: Path, records: bytes) -> None:
@@ -146,8 +160,18 @@ def test_topics_without_messages_are_kept_or_named(convert, tmp_path):
 def test_metadata_of_each_part_of_a_bag_are_kept(convert, tmp_path):
     for number in range(2):
         write_log(tmp_path / "bag" / f"run_{number}.mcap", beside=number == 0)
-    assert convert(tmp_path / "bag", tmp_path / "out.mcap").returncode == 3
+    assert convert(tmp_path / "bag", tmp_path / "out.mcap").returncode == 0
     with (tmp_path / "out.mcap").open("rb") as file:
         found = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
+        file.seek(0)
+        assert [record.name for record in make_reader(file).iter_attachments()] == ["calibration.yaml"]
     assert found["rig"] == {"camera": "left", "mount": "roof"}
-    assert "attachments are not carried over: calibration.yaml" in found["imutool/remarks"].values()
+
+
+def test_attachments_of_a_part_whose_recorder_died_are_kept(convert, tmp_path):
+    part = write_log(tmp_path / "bag" / "run_0.mcap", beside=True)
+    raw = part.read_bytes()
+    part.write_bytes(raw[: int.from_bytes(raw[-28:-20], "little") - 13])
+    assert convert(tmp_path / "bag", tmp_path / "out.mcap").returncode == 3  # the part was not finished
+    with (tmp_path / "out.mcap").open("rb") as file:
+        assert [record.data for record in make_reader(file).iter_attachments()] == [b"gain: 1"]

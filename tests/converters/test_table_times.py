@@ -541,7 +541,10 @@ def test_the_damaged_field_of_a_column_of_times_is_named(tmp_path, form, damaged
         read(tmp_path / "log.csv")
 
 
-@pytest.mark.parametrize("names", [("system_time_ms", "sensor_timestamp_ns"), ("timestamp", "event_timestamp")])
+@pytest.mark.parametrize(
+    "names",
+    [("system_time_ms", "sensor_timestamp_ns"), ("timestamp", "event_timestamp"), ("host_time_ms", "my_device_time_ns")],
+)
 def test_a_sensors_own_time_counts_and_not_the_uneven_one_of_the_program(tmp_path, names):
     program = 1_700_000_000_000 + np.rint(1e3 * T_S).astype(int) + np.abs(np.rint(RNG.normal(0.0, 1.5, COUNT))).astype(int)
     own = 50_000_000_000_000 + NEXT_NS * np.arange(COUNT)

@@ -999,3 +999,57 @@ def test_a_structure_of_matlab_for_each_sample_is_a_table(tmp_path):
     samples = np.array([*zip(*columns, strict=True)], [(name, object) for name in NAMES])
     scipy.io.savemat(tmp_path / "imu.mat", {"IMU_data": samples})
     np.testing.assert_allclose(read(tmp_path / "imu.mat").imus["/imu0"].accel, 9.80665 * ACCEL_G)
+
+
+def kalibr(folder: Path, gyro: np.ndarray, alpha: np.ndarray) -> Path:
+    names = ["timestamp", *(f"{of}_{axis}" for of in ("omega", "alpha") for axis in "xyz")]
+    return write_csv(folder / "imu0.csv", names, [1.4e18 + 1e9 * T_S, *gyro.T, *alpha.T])
+
+
+def test_a_table_for_kalibr_is_in_its_units_also_at_rest(tmp_path):
+    """Its accelerations are named alpha, and nothing in a table at rest shows the unit of the gyro."""
+    log = read(kalibr(tmp_path, 1e-4 * COUNTS + 1e-6, 9.81 * ACCEL_G))
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, 1e-4 * COUNTS + 1e-6)
+    np.testing.assert_allclose(log.imus["/imu0"].accel, 9.81 * ACCEL_G)
+
+
+def test_an_angular_acceleration_is_no_accelerometer(tmp_path):
+    with pytest.raises(ConfigError, match="gravity was taken out"):
+        read(kalibr(tmp_path, COUNTS, COUNTS - COUNTS.mean(axis=0)))
+
+
+def test_a_folder_of_matlab_mobile_is_a_recording(tmp_path):
+    times = [f"30-Nov-2025 10:53:{second:06.3f}" for second in T_S]
+    for name, values in (("AngularVelocity", 0.01 * COUNTS), ("Acceleration", 9.81 * ACCEL_G)):
+        rows = [f"{t},{x},{y},{z}" for t, (x, y, z) in zip(times, values, strict=True)]
+        (tmp_path / f"{name}.csv").write_text("\n".join(["Timestamp,X,Y,Z", *rows]) + "\n")
+    (sequence,) = table.sequences(tmp_path)
+    imu = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"}).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, 0.01 * COUNTS)
+    np.testing.assert_allclose(imu.accel, 9.81 * ACCEL_G)
+    assert imu.t_ns[0] == 1_764_499_980_000_000_000  # UTC, as no zone is stated
+
+
+def test_the_minus_of_typography_is_one(tmp_path):
+    """Programs write it in the numbers of Sweden, Norway and Finland."""
+    path = write_csv(
+        tmp_path / "imu.csv", ["time [s]", *NAMES[1:4], *(f"g{a} [deg/s]" for a in "xyz")], [T_S, *ACCEL_G.T, *COUNTS.T]
+    )
+    path.write_text(path.read_text().replace("-", "\N{MINUS SIGN}"), encoding="utf-8")
+    np.testing.assert_allclose(read(path).imus["/imu0"].gyro, np.deg2rad(COUNTS))
+
+
+def test_a_temperature_that_rises_is_no_time_next_to_one(tmp_path):
+    names = ["T", "Time", *NAMES[1:4], *(f"g{a} [deg/s]" for a in "xyz")]
+    log = read(write_csv(tmp_path / "imu.csv", names, [20.0 + 0.005 * np.arange(COUNT), T_S, *ACCEL_G.T, *COUNTS.T]))
+    assert np.array_equal(log.imus["/imu0"].t_ns, np.round(1e9 * T_S))
+
+
+def test_imus_of_one_table_share_the_unit_that_one_shows(tmp_path):
+    axes = [f"{side}_{sensor}_{axis}" for side in ("left", "Right") for sensor in ("gyr", "acc") for axis in "xyz"]
+    shows, hides = COUNTS / 131, RNG.normal(0.0, 0.1, (COUNT, 3))
+    path = write_csv(tmp_path / "two.csv", ["time [s]", *axes], [T_S, *shows.T, *ACCEL_G.T, *hides.T, *ACCEL_G.T])
+    imus = read(path).imus
+    np.testing.assert_allclose(imus["/right/imu"].gyro, np.deg2rad(hides))
+    with pytest.raises(ConfigError, match="state no unit of the gyro"):
+        read(write_csv(tmp_path / "one.csv", ["time [s]", *axes[6:]], [T_S, *hides.T, *ACCEL_G.T]))

@@ -465,14 +465,21 @@ def test_an_imu_whose_definition_has_another_order_is_read_in_its_own(tmp_path: 
     assert (imu.gyro[0].tolist(), imu.accel[0].tolist()) == ([0.1, 0.2, 0.3], [0.0, 0.0, 9.8])
 
 
-@pytest.mark.parametrize("encoding", ["cbor", "msgpack"])
-def test_a_log_whose_messages_are_not_searched_says_so(tmp_path: Path, encoding: str) -> None:
+@pytest.mark.parametrize(
+    ("encoding", "hint"),
+    [
+        ("cbor", "Messages in cbor are not searched for an IMU: record them as"),
+        ("msgpack", "A message in msgpack is an IMU if its fields are named as"),
+        ("protobuf", "A message in protobuf is an IMU if its fields are named as"),  # which is installed
+    ],
+)
+def test_a_log_without_an_imu_says_how_messages_are_searched(tmp_path: Path, encoding: str, hint: str) -> None:
     with (tmp_path / "log.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
         writer.add_message(writer.register_channel("/imu", encoding, 0), 1, b"\xa0", 1)
         writer.finish()
-    with pytest.raises(LogError, match=f"no IMU topic.* Messages in {encoding} are not searched for an IMU: record them as"):
+    with pytest.raises(LogError, match=f"no IMU topic.* {hint}"):
         read(tmp_path / "log.mcap")
 
 

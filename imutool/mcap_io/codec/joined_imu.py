@@ -18,7 +18,8 @@ from imutool.mcap_io.codec.schemas import ACCELS, VECTOR3
 
 SENSOR_WORDS = r"gyro(scope)?", r"accel(erometer)?"
 JOIN_VECTORS = "; imutool debias and others read a gyro's and an accelerometer's vectors as one: --imu gyro=TOPIC,accel=TOPIC"
-READ, IDL = {"cdr", "ros1", "protobuf", "json", "flatbuffer"}, {"ros2idl", "omgidl"}  # encodings; languages of definitions
+BY_NAMES = {"protobuf", "json", "msgpack", "flatbuffer"}  # encodings whose messages are an IMU by the names of their fields
+READ, IDL = {"cdr", "ros1", *BY_NAMES}, {"ros2idl", "omgidl"}  # encodings; languages of definitions
 Cut = Iterator[tuple[Shaped[np.ndarray, " n"], UInt8[np.ndarray, "n L"]]]  # heads and payloads of equal size
 
 
@@ -97,13 +98,19 @@ def no_imu_fix(topics: Iterable[tuple[str, str, str]]) -> str:
         return "`imu` gyro=TOPIC,accel=TOPIC joins the vectors of a gyroscope (rad/s) and of an accelerometer (m/s²)"
     if {"px4_msgs/msg/SensorGyro", "px4_msgs/msg/VehicleImu"} & {*types}:
         return "imutool convert makes an IMU of PX4's topics"
-    if unread := unread_fix({*encodings}, {*languages}):
-        return unread
-    return "An IMU in protobuf is read with: pip install 'imutool[protobuf]'" if "protobuf" in encodings else ""
+    return unread_fix({*encodings}, {*languages})
 
 
 def unread_fix(encodings: Set[str], languages: Set[str]) -> str:
-    """Hint at messages and definitions in which no IMU is looked for; may be empty."""
-    unread = sorted((encodings - READ) | (languages & IDL))
-    what = f"Messages in {' and '.join(unread)} are not searched for an IMU"
-    return f"{what}: record them as messages of ROS, protobuf or JSON" if unread else ""
+    """Hint at how messages of these encodings are searched for an IMU; may be empty."""
+    if unread := sorted((encodings - READ) | (languages & IDL)):
+        what = f"Messages in {' and '.join(unread)} are not searched for an IMU"
+        return f"{what}: record them as messages of ROS, protobuf or JSON"
+    if "protobuf" in encodings:
+        try:
+            import google.protobuf  # noqa: F401
+        except ImportError:
+            return "An IMU in protobuf is read with: pip install 'imutool[protobuf]'"
+    if not (named := sorted(BY_NAMES & encodings)):
+        return ""
+    return f"A message in {' or '.join(named)} is an IMU if its fields are named as an angular velocity and an acceleration"

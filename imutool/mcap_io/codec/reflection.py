@@ -1,6 +1,6 @@
 """IMU messages and poses of other types and encodings, found by reflection on their fields.
 
-Fields come from protobuf descriptors, FlatBuffers schemas, `ros2msg` definitions, or the first JSON message.
+Fields come from protobuf descriptors, FlatBuffers schemas, `ros2msg` definitions, or the first message in JSON or MessagePack.
 A message is that of an IMU if it holds an angular velocity and a linear acceleration of three numbers each, by the names of its
 fields, in rad/s and m/s². It is a pose if its type or topic says so and it holds a position (m) and a quaternion.
 A message that lacks them has NaN, so that `clean` can leave it out.
@@ -23,7 +23,6 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
-from imutool.mcap_io.codec.flatbuffer import FlatBuffer
 from imutool.mcap_io.codec.formats import (
     ACCEL,
     DEPTH,
@@ -34,7 +33,6 @@ from imutool.mcap_io.codec.formats import (
     TEXT,
     UNITS_NS,
     Format,
-    Json,
     Path,
     Tree,
     beginning,
@@ -47,6 +45,8 @@ from imutool.mcap_io.codec.formats import (
     unit_ns,
     vector_in,
 )
+from imutool.mcap_io.codec.formats.flatbuffer import FlatBuffer
+from imutool.mcap_io.codec.formats.objects import OF_OBJECTS, Json
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
 from imutool.mcap_io.codec.schemas import GYRO_COVARIANCE, IMU, POSE, runs
 from imutool.mcap_io.codec.transforms import TYPE, Transforms
@@ -198,7 +198,7 @@ class Reflected:
 def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: bytes | None) -> Reflected | Transforms | None:
     """Fields of an IMU, a pose or transforms in messages of a schema; None of others.
 
-    JSON goes by the `first` message, protobuf and FlatBuffers by the schema.
+    JSON and MessagePack go by the `first` message, protobuf and FlatBuffers by the schema.
 
     Raises:
         ImportError: the schema is of protobuf, which is not installed.
@@ -223,19 +223,19 @@ def format_of(encoding: str, schema_name: str, schema: bytes) -> Any:
     Raises:
         ImportError: the schema is of protobuf, which is not installed.
     """
-    if encoding == "json":
-        return Json(schema)
+    if encoding in OF_OBJECTS:
+        return OF_OBJECTS[encoding](schema)
     if encoding == "flatbuffer":
         return FlatBuffer.of(schema_name, schema)
     if encoding != "protobuf":
         return None
-    from imutool.mcap_io.codec.protobuf import Protobuf
+    from imutool.mcap_io.codec.formats.protobuf import Protobuf
 
     return Protobuf.of(schema_name, schema)
 
 
 def tree_of(form: Any, first: bytes) -> Any:
-    """Tree of the fields, by the schema or, of JSON, by the first message.
+    """Tree of the fields, by the schema or, of JSON and MessagePack, by the first message.
 
     Raises:
         ValueError: that is no message.

@@ -184,3 +184,5 @@ class Transforms:
             except LACKS:
                 continue
             yield parts[0] * NS_PER_S + parts[1]
+        with suppress(*LACKS):
+            yield int(self.format.at(message, ("timestamp",)))  # protobuf writes it in JSON as a date

@@ -1,6 +1,6 @@
 """Read any number of any message by topic and path: `/joint_states.position[2]`.
 
-Messages are those of ROS 2, of ROS 1, or in protobuf, JSON or FlatBuffers. One chunk is in memory at a time.
+Messages are those of ROS 2, of ROS 1, or in protobuf, JSON, MessagePack or FlatBuffers. One chunk is in memory at a time.
 """
 
 from __future__ import annotations

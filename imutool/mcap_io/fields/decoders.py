@@ -1,7 +1,8 @@
 """Numbers of messages by path, whatever the encoding: a decoder for each of two kinds.
 
 `Described` messages (CDR, ROS 1) have a definition: one message is walked, and messages that share its counts are cut out in
-one numpy pass. `Parsed` messages (JSON, protobuf, FlatBuffers) have no fixed place for a number, and are parsed one by one.
+one numpy pass. `Parsed` messages (JSON, MessagePack, protobuf, FlatBuffers) have no fixed place for a number, and
+are parsed one by one.
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ def decoder_of(log: Log, topic: Topic) -> Decoder:
         raise LogError(
             f"{topic.name} is described as {topic.schema_encoding or 'nothing'!r} and encoded as {topic.message_encoding!r}",
             where=where,
-            expected="ros2msg and cdr, ros1msg and ros1, protobuf, json or flatbuffer",
+            expected="ros2msg and cdr, ros1msg and ros1, protobuf, json, msgpack or flatbuffer",
             fix="Record it with ROS 2's own MCAP plugin",
         )
     try:

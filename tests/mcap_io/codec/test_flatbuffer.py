@@ -12,7 +12,7 @@ import pytest
 
 from imutool.mcap_io.codec.decode import decode_poses
 from imutool.mcap_io.codec.encode import encode_imu
-from imutool.mcap_io.codec.flatbuffer import FlatBuffer
+from imutool.mcap_io.codec.formats.flatbuffer import FlatBuffer
 from imutool.mcap_io.codec.reflection import reflect
 
 MADE = json.loads((Path(__file__).parents[2] / "fixtures" / "flatbuffer.json").read_text())

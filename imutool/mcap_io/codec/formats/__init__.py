@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice, pairwise
@@ -15,6 +14,7 @@ from imutool.mcap_io.codec.schemas import NS_PER_S
 STAMP = r"timestamp|stamp|time|sensor_?time"
 CLOCK = r"((hw|hardware|device|sensor|sample|imu|host|header|capture|ts)_?)?(time|time_?stamp|stamp|t|ts)"
 COUNTED = {rf"{CLOCK}_?ns(ec)?": 1, rf"{CLOCK}_?us(ec)?|utime": 1000}  # stamps of one number
+DATED = rf"{CLOCK}|(.*_)?(date_?time|utc(_?time)?)"
 COUNT = rf"ticks?|{CLOCK}(_?(s(ec(ond)?s?)?|m(illi)?s(ec(ond)?s?)?))?"  # without a unit, or in one that is coarse
 UNITS_NS = {1: "ns", 1000: "us", 10**6: "ms", NS_PER_S: "s"}
 FEW, MIN_PASSED_NS, MAX_PASSED_NS = 2000, NS_PER_S // 4, 10 * NS_PER_S  # messages that show the unit, and their time
@@ -55,6 +55,7 @@ MAX_ROW = 64  # numbers of a list that are fields of their own
 DEEPEST, MAX_FIELDS = 24, 5000  # of a message's numbers: messages within messages, and fields; one can nest without end
 MAX_BYTES = 1 << 23  # of a message or schema that becomes objects: JSON of 180 MB, 6 kB when packed, took 4.6 GB and a minute
 NUMBER, VECTOR, MATRIX, TEXT = "number", "vector", "matrix", "text"
+TIME = "time"  # a text with a date and time, whose value is ns since 1970
 Path = tuple[str | int, ...]  # of a field; a number of a list has its place at the end
 Tree = Mapping[str, Any]  # of fields: NUMBER, VECTOR, MATRIX, TEXT or a tree
 LACKS = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)  # raised where a message lacks a field
@@ -122,6 +123,8 @@ def stamps_of(fields: Iterable[tuple[Path, str, Any]]) -> Iterator[tuple[tuple[P
             named = [[(key, size) for key, size in part.items() if node.get(key) == NUMBER] for part in (SECONDS, FRACTIONS)]
             if all(named):
                 yield tuple(((*path, key), size) for (key, size), *_ in named)
+        if node == TIME and re.fullmatch(DATED, name):
+            yield ((path, 1),)
         for pattern, size in COUNTED.items():
             if node == NUMBER and re.fullmatch(pattern, name):
                 yield ((path, size),)
@@ -188,100 +191,6 @@ def refuse_long(raw: bytes) -> None:
     """
     if len(raw) > MAX_BYTES:
         raise ValueError(f"more than {MAX_BYTES} bytes")
-
-
-def _tree(value: Any, depth: int) -> Any:
-    """Tree of the fields of a JSON value."""
-    if isinstance(value, int | float | str) and not isinstance(value, bool):
-        return TEXT if isinstance(value, str) else NUMBER
-    if isinstance(value, list):
-        numbers = all(isinstance(part, int | float) and not isinstance(part, bool) for part in value)
-        return {3: VECTOR, 9: MATRIX}.get(len(value), "") if numbers else ""
-    return {name: _tree(part, depth - 1) for name, part in value.items()} if depth and isinstance(value, dict) else ""
-
-
-class Json:
-    """Messages in JSON, perhaps with a JSON Schema."""
-
-    def __init__(self, schema: bytes = b"") -> None:
-        try:
-            self._schema = self.parse(schema or b"{}")
-        except ValueError:
-            self._schema = {}
-
-    def comments(self, path: Path) -> Iterator[str]:
-        """What the schema says of a field and of those around it, the nearest first."""
-        nodes, found = self._with_referred([self._schema]), list[str]()
-        for key in path:
-            inner = (node.get("properties") for node in nodes)
-            nodes = self._with_referred(properties.get(key) for properties in inner if isinstance(properties, dict))
-            texts = (node.get(name) for name in ("unit", "units", "description", "title") for node in nodes)
-            found.append(next((text for text in texts if isinstance(text, str) and text), ""))
-        yield from reversed(found)
-
-    def _with_referred(self, nodes: Iterable[Any]) -> list[dict[str, Any]]:
-        """Schemas of a field, and those that they refer to or are made of."""
-        found, waiting = list[dict[str, Any]](), [*nodes]
-        while waiting and len(found) < MAX_ROW:
-            if not isinstance(node := waiting.pop(0), dict):
-                continue
-            found.append(node)
-            if isinstance(reference := node.get("$ref"), str) and reference.startswith("#/"):
-                waiting.append(_inside(self._schema, reference[2:].split("/")))
-            waiting += [part for name in ("allOf", "anyOf", "oneOf") if isinstance(node.get(name), list) for part in node[name]]
-        return found
-
-    def parse(self, raw: bytes) -> Any:
-        """Value from its text.
-
-        Raises:
-            ValueError: it is no JSON, too long, or nests too deep.
-        """
-        refuse_long(raw)
-        try:
-            return json.loads(raw)
-        except RecursionError as error:
-            raise ValueError("nests too deep") from error
-
-    def at(self, message: Any, path: Path) -> Any:
-        """Value of a field.
-
-        Raises:
-            KeyError, IndexError, TypeError: the message lacks it.
-            ValueError: it is a truth value.
-        """
-        for key in path:
-            message = message[key]
-        if isinstance(message, bool):
-            raise ValueError("a truth value is no number")
-        return message
-
-    def new(self, values: Sequence[tuple[Path, Any]]) -> bytes:
-        """Text of a message with these fields."""
-        return json.dumps(nested(values)).encode()
-
-    def tree(self, message: Any) -> Any:
-        """Tree of the fields of one message."""
-        return _tree(message, DEPTH)
-
-    def numbers(self, message: Any) -> Iterator[Path]:
-        """Paths of all numbers in a message."""
-        yield from islice(_numbers(message, ()), MAX_FIELDS)
-
-
-def _numbers(value: Any, path: Path) -> Iterator[Path]:
-    if isinstance(value, dict | list) and len(path) < DEEPEST:
-        for key, part in value.items() if isinstance(value, dict) else enumerate(value[: MAX_ROW + 1]):
-            yield from _numbers(part, (*path, key))
-    elif isinstance(value, int | float) and not isinstance(value, bool) and path:
-        yield path
-
-
-def _inside(node: Any, keys: Iterable[str]) -> Any:
-    """Part of a JSON value by the names of objects in objects; None where it lacks one."""
-    for key in keys:
-        node = node.get(key) if isinstance(node, dict) else None
-    return node
 
 
 def nested(values: Sequence[tuple[Sequence[str | int], Any]]) -> dict[str, Any]:
