@@ -40,7 +40,7 @@ from imutool.cleaning.survey import raw_batches
 from imutool.cleaning.truth import read_truth
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.file_location import Location, log_name
-from imutool.inertial.stationary import Blocks, block_statistics, white_noise
+from imutool.inertial.stationary import CALM, Blocks, block_statistics, white_noise
 from imutool.log_info.convention_report import contradictions, warn_of_conventions
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
@@ -263,7 +263,7 @@ def _samples(log: Log, topic: str, survey: Survey | None, end_ns: int | None) ->
 
 def _noise(imu: Imu) -> Float64[np.ndarray, "6"]:
     """White noise of a sample, for a model without noise figures and a log without rest."""
-    return white_noise(np.concatenate([imu.gyro, imu.accel], axis=1), imu.period_s)
+    return np.asarray(CALM * white_noise(np.concatenate([imu.gyro, imu.accel], axis=1), imu.period_s))
 
 
 def estimate_at_rest(imu: Imu, where: str | Location) -> tuple[BiasModel, InitialBias]:
