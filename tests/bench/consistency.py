@@ -2,7 +2,7 @@
 
     python tests/bench/consistency.py --model M.safetensors|static LOG... [--start truth|auto|smooth] [--each-log]
     python tests/bench/consistency.py --left-out TRAINING_LOG...
-    python tests/bench/consistency.py --made-up SENSORS [--known rest walk prior speed]
+    python tests/bench/consistency.py --made-up SENSORS [--rest 0|8] [--known rest walk prior speed]
 
 The bias: every `TRUTH_S` of a log the gyro's rest bias is measured from the truth around (the slope, in time, of what
 integration misses), and the difference to the bias in use is weighed by its covariance plus that of the measurement. Attitude
@@ -68,7 +68,7 @@ from imutool.sensor.made_up_flight import ACCEL
 
 STARTS = ("truth", "auto", "smooth")
 WINDOWS_S = (1.0, 5.0, 15.0)
-TRAINING, TESTS = 4, 3
+TRAINING, TESTS, RESTS_S = 4, 3, (0.0, 8.0)
 ERRORS = ("truth_noise", "turn_on_rad_s", "scale", "misalignment_rad", "noise_rad_s_rthz", "walk_rad_s2_rthz")  # of a gyro
 KNOWN, CORRELATION_S = ("rest", "walk", "prior", "speed"), FilterSettings().speed_correlation_s
 
@@ -91,6 +91,7 @@ def main() -> None:
     which.add_argument("--model", type=Path)
     which.add_argument("--left-out", action="store_true")
     which.add_argument("--made-up", type=int, metavar="SENSORS")
+    parser.add_argument("--rest", type=float, choices=RESTS_S, help="only made-up sensors with such a stop (s)")
     parser.add_argument("--known", nargs="+", choices=KNOWN, default=[])
     parser.add_argument("--start", action="append", choices=STARTS)
     parser.add_argument("--each-log", action="store_true")
@@ -100,7 +101,7 @@ def main() -> None:
     options = parser.parse_args()
     found: dict[tuple[str, str], list[Judgement]] = defaultdict(list)
     starts = options.start or STARTS
-    cases = made_up(options.made_up) if options.made_up else recorded(options.logs, options.model)
+    cases = made_up(options.made_up, options.rest) if options.made_up else recorded(options.logs, options.model)
     for case in cases:
         if options.turn_error:
             case.model.card = {**case.model.card, "turn_error": options.turn_error}
@@ -126,8 +127,8 @@ def recorded(paths: list[Path], model: Path | None) -> Iterator[Case]:
             yield Case(one, load(model) if model else learned_from([other for other in logs if other is not one]))
 
 
-def made_up(sensors: int) -> Iterator[Case]:
-    """Logs of sensors of many sizes, each with a model of its own that other logs gave."""
+def made_up(sensors: int, rest_s: float | None = None) -> Iterator[Case]:
+    """Logs of sensors of many sizes, each with a model of its own that other logs gave; `rest_s` chooses among them."""
     for seed in range(sensors):
         rng = np.random.default_rng([seed, 20])
         kind = Switchings(
@@ -141,9 +142,11 @@ def made_up(sensors: int) -> Iterator[Case]:
             room_m=10.0 ** rng.uniform(-0.7, 0.3),
             mount_rad=0.0,
             clock_s=0.0,
-            rest_s=float(rng.choice([0.0, 8.0])),
+            rest_s=float(rng.choice(RESTS_S)),
             duration_s=60.0,
         )
+        if rest_s not in (None, kind.rest_s):
+            continue
         first = 100 * seed
         model = learned_from([log(first + k, first, kind) for k in range(TRAINING)])
         for k in range(50, 50 + TESTS):
