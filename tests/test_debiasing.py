@@ -223,8 +223,9 @@ def test_covariances_are_positive_and_as_large_as_the_noise(source: Path, tmp_pa
     debias(source, tmp_path / "out.mcap", model=path, init=init)
     orientation, *others = covariances(tmp_path / "out.mcap")
     assert (orientation[:, 0, 0] == -1).all()  # as REP 145 says: no orientation here
+    minimum = 0.9 if method == "static" else 0.5  # of a model that was made with less
     for covariance, noise in zip(others, (2.4e-3, 0.028), strict=True):
-        assert (np.linalg.eigvalsh(covariance) > 0.5 * noise**2).all()
+        assert (np.linalg.eigvalsh(covariance) > minimum * noise**2).all()
         np.testing.assert_allclose(covariance, covariance.transpose(0, 2, 1), rtol=1e-9, atol=1e-15)
 
 

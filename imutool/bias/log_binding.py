@@ -12,7 +12,7 @@ from imutool.array_types import Float64, Int64
 from imutool.bias.model import COLUMNS, BiasModel, Covariances, Vector6
 from imutool.bias.temperature import TemperatureFilter, celsius_of, channel_of, holding, scale_of
 from imutool.errors import ModelError
-from imutool.inertial.stationary import white_noise
+from imutool.inertial.stationary import CALM, white_noise
 from imutool.mcap_io.temperature import EVERY_NS, is_temperature, thinned
 from imutool.recording import Imu, Scalars
 from imutool.recording.columns import quantile
@@ -65,7 +65,7 @@ def other_conditions(model: BiasModel, samples: tuple[Float64[np.ndarray, " n"],
     steps = np.diff(samples[0])
     margin = min(0.5, 0.5 * SURE / math.sqrt(len(steps)))  # of the median's rank, however the steps scatter
     shortest, period_s, longest = (float(quantile(steps, share)) for share in (0.5 - margin, 0.5, 0.5 + margin))
-    noise = white_noise(np.concatenate([samples[1], samples[2]], axis=1), period_s)
+    noise = CALM * white_noise(np.concatenate([samples[1], samples[2]], axis=1), period_s)
     known = model.noise_std > 0
     ratio = float((noise[known] / model.noise_std[known]).max()) if known.any() else 0.0
     if ratio > MAX_NOISE:  # less noise is no doubt: a drone in the hand has a tenth of that in flight

@@ -32,7 +32,7 @@ from imutool.bias_start.prior_width import MAX_DEVIATIONS, BiasPrior, supported_
 from imutool.errors import DataError
 from imutool.inertial.inertial_filter import MIN_FORCE_M_S2
 from imutool.inertial.innovations import MIN_DRIVEN_M_S, SURPRISING, innovations
-from imutool.inertial.stationary import MAX_SHAKING, Blocks, rest_stretches, resting_blocks, white_noise
+from imutool.inertial.stationary import CALM, MAX_SHAKING, Blocks, rest_stretches, resting_blocks, white_noise
 from imutool.recording import GRAVITY_M_S2, Imu, nanoseconds
 from imutool.recording.columns import true_ranges
 
@@ -84,7 +84,7 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
     std = np.sqrt(np.diag(P))  # in motion, where the bias is used
     source = f"{end_s - begin_s:.1f} s at rest from {begin_s:.1f} s on" + f", {training_source(model)}" * bool(model.card)
     how = f"{source}, {accuracy(std)}, then {TRACKED_BY}"
-    return InitialBias(rest, std, how, white_noise(u[at_stop]), track, before, end_s)
+    return InitialBias(rest, std, how, CALM * white_noise(u[at_stop]), track, before, end_s)
 
 
 def _up_to_first_stop(model: BiasModel, imu: Imu, before: BiasPrior) -> list[FilteredBlock]:

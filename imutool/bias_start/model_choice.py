@@ -40,7 +40,7 @@ from imutool.cleaning.survey import raw_batches
 from imutool.cleaning.truth import read_truth
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.file_location import Location, log_name
-from imutool.inertial.stationary import Blocks, block_statistics, white_noise
+from imutool.inertial.stationary import CALM, Blocks, block_statistics, white_noise
 from imutool.log_info.convention_report import contradictions, warn_of_conventions
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
@@ -144,7 +144,7 @@ def choose_model_and_start(
         start = find_initial_bias(init, model, first_minute)
     if not start.noise.any():  # neither the model nor rest shows it
         samples = np.concatenate([first_minute.imu.gyro, first_minute.imu.accel], axis=1)
-        start = replace(start, noise=white_noise(samples, period_s))
+        start = replace(start, noise=CALM * white_noise(samples, period_s))
     return model, start
 
 

@@ -22,7 +22,7 @@ from imutool.bias_start.bias_from_truth import MIN_TRUTH_STD, TRUTH_S, bias_from
 from imutool.bias_start.initial_bias import AT_REST_STD, SESSION_GAP_S
 from imutool.bias_start.prior_width import USUAL_WALK
 from imutool.geometry import so3
-from imutool.inertial.stationary import white_noise
+from imutool.inertial.stationary import CALM, white_noise
 from imutool.recording import nanoseconds
 from imutool.training.calibration import closed_form
 from imutool.training.calibration.log_scatter import NUISANCE_STD
@@ -70,7 +70,7 @@ def store_statistics(
     rest, std = rest.clone(), torch.zeros_like(rest)
     shown = np.repeat([sensor in pool.sensors for sensor in SENSORS], 3)
     samples = torch.cat([pool.gyro, pool.accel], dim=1).cpu().numpy()
-    model.noise_std.copy_(torch.from_numpy(white_noise(samples, 1.0 / pool.rate_hz)))
+    model.noise_std.copy_(torch.from_numpy(CALM * white_noise(samples, 1.0 / pool.rate_hz)))
     for sensor in pool.sensors:
         columns = COLUMNS[sensor]
         solution = closed_form.solve(scored, sensor, residual, rest, window_s[sensor], matrix=False, part="all")

@@ -2,21 +2,23 @@
 
     python tests/bench/consistency.py --model M.safetensors|static LOG... [--start truth|auto|smooth] [--each-log]
     python tests/bench/consistency.py --left-out TRAINING_LOG...
-    python tests/bench/consistency.py --made-up SENSORS
+    python tests/bench/consistency.py --made-up SENSORS [--rest 0|8] [--known rest walk prior speed]
 
 The bias: every `TRUTH_S` of a log the gyro's rest bias is measured from the truth around (the slope, in time, of what
 integration misses), and the difference to the bias in use is weighed by its covariance plus that of the measurement. Attitude
-and velocity: the debiased samples are integrated from a true pose for `WINDOWS_S`, and the errors at the end are weighed by the
-stated covariance of the bias, carried over the window, the white noise of the samples and the poses' own errors
+and velocity: the debiased samples are integrated from a true pose for `WINDOWS_S`, and the errors at the end are weighed by
+the stated covariance of the bias, carried over the window, the white noise of the samples and the poses' own errors
 (`tests/support/error_growth.py`). Each has three degrees of freedom: honest covariances give a mean of 3; the bounds are
 chi-square's. The coverage is the share of windows within the ellipsoids that should hold 68, 95 and 99.7 % of them. With
 `--left-out` each log is judged by the closed form of all others. `--made-up` draws sensors, each with its own size of errors
 and noise, learns each from `TRAINING` logs of one switching-on, and judges it by the exact poses of `TESTS` logs of others:
-here the poses have no error, and there are windows enough to see a few points. V1_01 is compared with its recomputed truth.
-With `--factor` a second coverage stands next to the first: each log's covariance of the bias times a factor by which the other
-logs' 68 % ellipsoids hold 68 % of their windows (split conformal prediction, with the logs as the sample). With `--learned` the
-logarithm of that factor is a linear function of a window's motion (`support.covariance_factors`), learned from the other logs
-by the likelihood of their errors: a covariance as one more head of the model, as AirIMU has (Qiu et al., arXiv 2310.04874).
+here the poses have no error, and there are windows enough to see a few points, and the rate of a debiased message is compared
+with the exact one. With `--known` the filter is told what such a sensor is like: no offset at rest, its own walk, the size of
+its turn-on bias, the speed of the body. V1_01 is compared with its recomputed truth. With `--factor` a second coverage stands
+next to the first: each log's covariance of the bias times a factor by which the other logs' 68 % ellipsoids hold 68 % of their
+windows (split conformal prediction, with the logs as the sample). With `--learned` the logarithm of that factor is a linear
+function of a window's motion (`support.covariance_factors`), learned from the other logs by the likelihood of their errors: a
+covariance as one more head of the model, as AirIMU has (Qiu et al., arXiv 2310.04874).
 
 The calibration's share of a window's covariance is that of the slope: its unknowns are the same at every sample, and what goes
 with the motion mostly cancels over 15 s, which the samples' covariances one by one do not show. What a measurement is worth is
@@ -33,9 +35,11 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from copy import copy
 from pathlib import Path
 from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -52,24 +56,31 @@ from support.switchings_on import Switchings, log
 from imutool.bias import static
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import load
+from imutool.bias_start import initial_bias
 from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
-from imutool.bias_start.initial_bias import InitialBias
+from imutool.bias_start.initial_bias import MIN_STD, InitialBias
 from imutool.bias_start.model_choice import estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.geometry import so3
+from imutool.inertial.inertial_filter import FilterSettings
 from imutool.inertial.windows import running_product, step_means
 from imutool.recording import Poses, Recording
+from imutool.sensor.made_up_flight import ACCEL
 
 STARTS = ("truth", "auto", "smooth")
 WINDOWS_S = (1.0, 5.0, 15.0)
-TRAINING, TESTS = 4, 3
+TRAINING, TESTS, RESTS_S = 4, 3, (0.0, 8.0)
+ERRORS = ("truth_noise", "turn_on_rad_s", "scale", "misalignment_rad", "noise_rad_s_rthz", "walk_rad_s2_rthz")  # of a gyro
+KNOWN, CORRELATION_S = ("rest", "walk", "prior", "speed"), FilterSettings().speed_correlation_s
 
 
 class Case(NamedTuple):
-    """A log, the model that judges it, and the exact poses where they are known."""
+    """A log, the model that judges it, and of a made-up sensor the exact poses, the exact rate and its kind."""
 
     recording: Recording
     model: BiasModel
     exact: Poses | None = None
+    rate: Float64[np.ndarray, "n 3"] | None = None
+    kind: Switchings | None = None
 
 
 def main() -> None:
@@ -80,6 +91,8 @@ def main() -> None:
     which.add_argument("--model", type=Path)
     which.add_argument("--left-out", action="store_true")
     which.add_argument("--made-up", type=int, metavar="SENSORS")
+    parser.add_argument("--rest", type=float, choices=RESTS_S, help="only made-up sensors with such a stop (s)")
+    parser.add_argument("--known", nargs="+", choices=KNOWN, default=[])
     parser.add_argument("--start", action="append", choices=STARTS)
     parser.add_argument("--each-log", action="store_true")
     parser.add_argument("--factor", action="store_true")
@@ -88,12 +101,12 @@ def main() -> None:
     options = parser.parse_args()
     found: dict[tuple[str, str], list[Judgement]] = defaultdict(list)
     starts = options.start or STARTS
-    cases = made_up(options.made_up) if options.made_up else recorded(options.logs, options.model)
+    cases = made_up(options.made_up, options.rest) if options.made_up else recorded(options.logs, options.model)
     for case in cases:
         if options.turn_error:
             case.model.card = {**case.model.card, "turn_error": options.turn_error}
         for start in starts:
-            for quantity, one in judged(case, start):
+            for quantity, one in judged_knowing(case, start, options.known):
                 found[start, quantity].append(one)
                 if options.each_log and len(one.error):
                     print(f"{start:7}{quantity:16}{case.recording.name:24}", told([one]), flush=True)
@@ -114,8 +127,8 @@ def recorded(paths: list[Path], model: Path | None) -> Iterator[Case]:
             yield Case(one, load(model) if model else learned_from([other for other in logs if other is not one]))
 
 
-def made_up(sensors: int) -> Iterator[Case]:
-    """Logs of sensors of many sizes, each with a model of its own that other logs gave."""
+def made_up(sensors: int, rest_s: float | None = None) -> Iterator[Case]:
+    """Logs of sensors of many sizes, each with a model of its own that other logs gave; `rest_s` chooses among them."""
     for seed in range(sensors):
         rng = np.random.default_rng([seed, 20])
         kind = Switchings(
@@ -129,16 +142,40 @@ def made_up(sensors: int) -> Iterator[Case]:
             room_m=10.0 ** rng.uniform(-0.7, 0.3),
             mount_rad=0.0,
             clock_s=0.0,
-            rest_s=float(rng.choice([0.0, 8.0])),
+            rest_s=float(rng.choice(RESTS_S)),
             duration_s=60.0,
         )
+        if rest_s not in (None, kind.rest_s):
+            continue
         first = 100 * seed
         model = learned_from([log(first + k, first, kind) for k in range(TRAINING)])
         for k in range(50, 50 + TESTS):
             test = log(first + k, first + k, kind)
-            exact = log(first + k, first + k, replaced(kind, truth_noise=0.0))
-            assert np.array_equal(test.imu.gyro, exact.imu.gyro)
-            yield Case(test, model, exact.truth)
+            exact = log(first + k, first + k, replaced(kind, **dict.fromkeys(ERRORS, 0.0)))
+            assert np.array_equal(test.imu.t_ns, exact.imu.t_ns)
+            yield Case(test, model, exact.truth, exact.imu.gyro, kind)
+
+
+def judged_knowing(case: Case, start: str, known: Sequence[str]) -> list[tuple[str, Judgement]]:
+    """Errors and their covariances by a filter that is told some of the sensor's own statistics."""
+    if case.kind is None or case.exact is None or not known:
+        return list(judged(case, start))
+    model, kind, tensors = copy(case.model), case.kind, dict(case.model.tensors)
+    if "rest" in known:
+        tensors["rest_std"] = MIN_STD
+    if "walk" in known:
+        tensors["walk_std"] = np.array([kind.walk_rad_s2_rthz] * 3 + [ACCEL.walk_density] * 3)
+    if "prior" in known:
+        std = np.array([kind.turn_on_rad_s] * 3 + [kind.turn_on_m_s2] * 3)
+        tensors |= {"prior_mean": np.zeros(6), "prior_std": std}
+        model.card = {key: model.card[key] for key in model.card if key not in ("sessions", "turn_on_least_std")}
+    if "speed" in known:
+        assert case.exact.v_w is not None
+        speed_m_s = float(np.sqrt((case.exact.v_w**2).mean()))
+        model.card = {**model.card, "speed": {"speed_m_s": speed_m_s, "speed_correlation_s": CORRELATION_S}}
+    model.tensors = tensors
+    with patch.object(initial_bias, "AT_REST_STD", MIN_STD if "rest" in known else initial_bias.AT_REST_STD):
+        return list(judged(case._replace(model=model), start))
 
 
 def replaced(kind: Switchings, **changes: float) -> Switchings:
@@ -165,6 +202,8 @@ def judged(case: Case, start: str) -> Iterator[tuple[str, Judgement]]:
     known = None if case.exact is None else np.zeros(6)
     one = Judged(model, begun, imu, case.exact or recording.truth, known)
     yield "bias", rest_bias(model, begun, one, from_s, recording)
+    if case.rate is not None:
+        yield "message", message(one, case.rate, from_s)
     for length_s in WINDOWS_S:
         grown = one.errors(length_s, from_s)
         for name, axes in (("attitude", slice(0, 3)), ("velocity", slice(3, 6))):
@@ -173,6 +212,15 @@ def judged(case: Case, start: str) -> Iterator[tuple[str, Judgement]]:
             parts = (P[:, axes, axes] for P in grown[1:])
             features = features_of(one.motion, one.motion.windows(length_s, from_s))[: len(grown.error)]
             yield f"{name} {length_s:g} s", Judgement(grown.error[:, axes], *parts, features)
+
+
+def message(one: Judged, rate: Float64[np.ndarray, "n 3"], from_s: float) -> Judgement:
+    """Errors of the debiased rate at the beginning of each second, and the covariance of its message."""
+    seconds = one.motion.windows(1.0, from_s)
+    rows = [second.start for second in seconds]
+    S, white = one.stated.roots[rows, :3], np.tile(np.diag(one.noise[:3] ** 2), (len(rows), 1, 1))
+    P = one.stated.rest[rows, :3, :3] + S @ S.transpose(0, 2, 1)
+    return Judgement(one.motion.samples[rows, :3] - rate[rows], P, white, features_of(one.motion, seconds))
 
 
 def rest_bias(model: BiasModel, begun: InitialBias, one: Judged, from_s: float, recording: Recording) -> Judgement:

@@ -21,7 +21,7 @@ from imutool.bias_start.initial_bias import from_numbers, relative_samples
 from imutool.bias_start.model_choice import find_initial_bias, smooth_in_memory
 from imutool.errors import ModelError
 from imutool.inertial.innovations import Share
-from imutool.inertial.stationary import white_noise
+from imutool.inertial.stationary import CALM, white_noise
 from imutool.recording import GRAVITY_M_S2, Imu, Recording, seconds
 from imutool.sensor.made_up_flight import flight
 
@@ -42,7 +42,7 @@ def model(recording: Recording) -> BiasModel:
     statistics = {
         "prior_mean": rest,
         "prior_std": np.array([1e-3] * 3 + [0.05] * 3),
-        "noise_std": white_noise(np.concatenate([recording.imu.gyro, recording.imu.accel], axis=1)),
+        "noise_std": CALM * white_noise(np.concatenate([recording.imu.gyro, recording.imu.accel], axis=1)),
     }
     made = linear.Model(linear.Config(), 1.0 / recording.imu.period_s, statistics)
     made.card = {"name": "own", "logs": [{}] * 3, **MADE_FOR}

@@ -170,10 +170,10 @@ class Judged:
         self.bias, rest = with_drift(model, imu.t_ns, self.bias, rest)
         self.motion = Motion(t_s, u - self.bias, quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted)
         self.stated = BiasCovariance(rest, stacked(self.roots, len(t_s)))
-        self._noise = np.where(model.noise_std > 0, model.noise_std, start.noise)
-        self._pose_std = pose_errors(self.motion, self._noise) if pose_std is None else pose_std
+        self.noise = np.where(model.noise_std > 0, model.noise_std, start.noise)
+        self._pose_std = pose_errors(self.motion, self.noise) if pose_std is None else pose_std
 
     def errors(self, window_s: float, from_s: float = 0.0) -> Grown:
         """Errors of integration over windows one after another, and their covariance; none where the poses are unknown."""
         windows = self.motion.windows(window_s, from_s) if np.isfinite(self._pose_std).all() else []
-        return grown(self.motion, windows, self.stated, self._noise, self._pose_std)
+        return grown(self.motion, windows, self.stated, self.noise, self._pose_std)
