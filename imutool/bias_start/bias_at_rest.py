@@ -1,4 +1,4 @@
-"""Initial bias measured at rest: true rate zero, specific force g along an unknown direction."""
+"""Initial bias measured at rest: rate zero, specific force g along an unknown direction."""
 
 from __future__ import annotations
 

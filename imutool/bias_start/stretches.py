@@ -39,7 +39,7 @@ NOT_FINITE, OUT_OF_RANGE, ZERO_FORCE = "not_finite", "out_of_range", "zero_force
 logger = logging.getLogger(__name__)
 Rows3 = Float64[np.ndarray, "n 3"]
 Answer = TypeVar("Answer")
-SampleColumns = tuple[Float64[np.ndarray, "..."], ...]  # times, gyro, accel
+SampleColumns = tuple[Float64[np.ndarray, " _"], Float64[np.ndarray, "_ 3"], Float64[np.ndarray, "_ 3"]]  # with times in s
 
 
 class Stretch(NamedTuple):

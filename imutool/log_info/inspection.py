@@ -50,7 +50,7 @@ CONVERTIBLE = {  # messages of which `convert` makes others
 def inspect(path: Location, *, check: bool = True, max_chunk: int | None = None) -> LogInfo:
     """Describe a log: topics, clocks, IMU defects and noise, coverage by the truth, warnings.
 
-    The sound part of a damaged log is described, and `losses` lists the rest. Every chunk is unpacked once to check it, and once
+    The sound part of a damaged log is described, and `losses` lists the rest. Each chunk is unpacked once to check it, and once
     more if it holds IMU messages; without `check` only these are, and damage elsewhere may go unnoticed. A chunk of more than
     `max_chunk` bytes counts as lost.
 
