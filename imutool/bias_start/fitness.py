@@ -100,7 +100,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     found = _trained(model, start, samples, about, prior)
     if found.verdict == "fits" or not refuted_stops(samples, model):
         return found
-    found = _trained(model, start, samples, about, replace(prior, stops=False))
+    found = _trained(model, start, samples, about, replace(prior, stops=False)) if prior.stops else found
     return Fitness(found.verdict, (*found.reasons, STEADY_TURN))
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,9 @@ import numpy as np
 from imutool.array_types import Bool, Float64, Int64
 from imutool.errors import LogError
 from imutool.file_location import Location
+from imutool.mcap_io.codec import messages
 from imutool.mcap_io.codec.decode import ImuBatch
+from imutool.mcap_io.log import Log
 from imutool.recording import nanoseconds
 
 BLOCK = 4096  # samples: what rules see at a time depends on the log alone, not on how its chunks were cut
@@ -42,6 +45,19 @@ class Samples(NamedTuple):
 def joined(parts: list[Samples]) -> Samples:
     """Concatenated samples."""
     return parts[0] if len(parts) == 1 else Samples(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def batches_by_topic(
+    log: Log,
+    topics: Collection[str],
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+    unreadable: Callable[[str, str], None] = lambda *_: None,
+) -> Iterator[tuple[str, ImuBatch]]:
+    """Messages of some IMUs as `raw_batches`: a chunk is unpacked once for all of them."""
+    for topic, rows in messages.joined(log.rows(topics, start_ns, end_ns)):
+        with log.named(topic):
+            yield from ((topic, batch) for batch in log.topics[topic].decode_imu(rows, partial(unreadable, topic)))
 
 
 class FrameCounts(Counter[str]):
@@ -95,23 +111,36 @@ def refuse_mixed(batches: Iterable[ImuBatch], topic: str, where: Location) -> No
         raise LogError(f"{topic}: {mixed}", where=where, expected="the messages of one sensor", fix=fix)
 
 
-def blocks(batches: Iterable[ImuBatch]) -> Iterator[Samples]:
+class BlockCutter:
     """Blocks of `BLOCK` messages, the last one shorter, whatever the batch sizes."""
-    parts: list[Samples] = []
-    count, waiting = 0, 0
+
+    def __init__(self) -> None:
+        self._parts: list[Samples] = []
+        self._count, self._waiting = 0, 0
+
+    def add(self, batch: ImuBatch) -> Iterator[Samples]:
+        """Blocks that a batch completes."""
+        number = np.arange(self._count, self._count + len(batch.stamp_ns))
+        values = np.concatenate([batch.gyro, batch.accel], axis=1)
+        self._parts.append(Samples(number, batch.log_time, batch.stamp_ns, values))
+        self._count, self._waiting = self._count + len(number), self._waiting + len(number)
+        if self._waiting >= BLOCK:
+            whole, end = joined(self._parts), self._waiting // BLOCK * BLOCK
+            self._parts, self._waiting = [whole.where(slice(end, None))], self._waiting - end
+            yield from (whole.where(slice(first, first + BLOCK)) for first in range(0, end, BLOCK))
+
+    def rest(self) -> Iterator[Samples]:
+        """The last block, if there is one."""
+        if self._waiting:
+            yield joined(self._parts)
+
+
+def blocks(batches: Iterable[ImuBatch]) -> Iterator[Samples]:
+    """Blocks of one IMU, one after the other."""
+    cutter = BlockCutter()
     for batch in batches:
-        n = len(batch.stamp_ns)
-        number = np.arange(count, count + n)
-        parts.append(Samples(number, batch.log_time, batch.stamp_ns, np.concatenate([batch.gyro, batch.accel], axis=1)))
-        count, waiting = count + n, waiting + n
-        if waiting >= BLOCK:
-            whole = joined(parts)
-            for first in range(0, waiting - BLOCK + 1, BLOCK):
-                yield whole.where(slice(first, first + BLOCK))
-            parts = [whole.where(slice(waiting // BLOCK * BLOCK, None))]
-            waiting %= BLOCK
-    if waiting:
-        yield joined(parts)
+        yield from cutter.add(batch)
+    yield from cutter.rest()
 
 
 def padded(stream: Iterable[Samples], margin: int) -> Iterator[tuple[Samples, slice]]:

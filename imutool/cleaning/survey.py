@@ -16,10 +16,10 @@ from imutool.cleaning.finding import Finding, FindingReport, Verdict, score, ver
 from imutool.cleaning.likelihood import axis_names
 from imutool.cleaning.rule import GROUP, CleaningSettings, Rule, TopicSummary
 from imutool.cleaning.rules.gaps import MISSING
-from imutool.cleaning.samples import FrameCounts, Motion, Samples, blocks, counted_frames
+from imutool.cleaning.samples import FrameCounts, Motion, Samples, batches_by_topic, blocks, counted_frames
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.errors import LogError
-from imutool.mcap_io.codec import messages, schemas
+from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import RESTAMP, ImuBatch
 from imutool.mcap_io.log import Log
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
@@ -272,10 +272,9 @@ def raw_batches(
     Raises:
         LogError: no such IMU topic, another encoding, or damage.
     """
-    described = log.topic(topic, (schemas.IMU,))
-    for rows in messages.joined(rows for _, rows in log.rows([described.name], start_ns, end_ns)):
-        with log.named(described.name):
-            yield from described.decode_imu(rows, unreadable)
+    name = log.topic(topic, (schemas.IMU,)).name
+    for _, batch in batches_by_topic(log, [name], start_ns, end_ns, lambda _, what: unreadable(what)):
+        yield batch
 
 
 def _reasons(settings: CleaningSettings, whole: TopicSummary, invalid: int, findings: Sequence[Finding]) -> Iterator[str]:

@@ -17,10 +17,13 @@ from imutool.cleaning import raw_batches
 from imutool.cleaning.rules.gaps import missing
 from imutool.cleaning.rules.not_finite import measured
 from imutool.cleaning.rules.saturation import AxisLimits
-from imutool.cleaning.samples import FrameCounts, Samples, blocks, counted_frames, joined
+from imutool.cleaning.samples import BlockCutter, FrameCounts, Samples, batches_by_topic, blocks, joined
 from imutool.cleaning.stamp_line import Stamps, distinct, read_stamps, restamped, usual_period
 from imutool.log_info.clock import IncreasingStamps, SensorStamps, sorted_stamps
+from imutool.log_info.kept_blocks import KeptBlocks
 from imutool.log_info.report import Interval
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
 from imutool.recording import nanoseconds
 from imutool.recording.columns import clock_jumps, median
@@ -29,6 +32,7 @@ from imutool.recording.sample_order import TICK_SPAN, ticked
 APART_NS = nanoseconds(60.0)  # of stretches that are read by themselves
 MAX_NAMED = 5  # unreadable messages
 ROUNDING_NS = 1024  # of times as floats
+READ_AT_ONCE = 8  # IMUs: a quarter of a megabyte of messages of each waits to be decoded
 MARGIN = TICK_SPAN + 1  # stamps on both sides that show whether a step lost samples
 NO_FAULTS = Stamps(np.zeros(0, np.int64), "", Counter(), 1.0, unset=False)
 
@@ -46,38 +50,54 @@ class ImuSamples:
         unsorted: whether the messages are one recording in another order than that of their log times.
     """
 
-    def __init__(self, log: Log, topic: str) -> None:
-        """Reads the IMU once.
+    def __init__(self, log: Log, topic: str, *, read: bool = True) -> None:
+        """Reads the IMU once, unless `read_imus` does.
 
         Raises:
             LogError: no such IMU topic, another encoding, or damage.
         """
-        self._log, self._topic = log, topic
+        self.log, self.topic = log, log.topic(topic, (schemas.IMU,)).name
         self._limits = AxisLimits(6)
         self._rank: Int64[np.ndarray, " n"] | None = None  # of each message among the samples, -1 of those that are none
         self._lag_ns = np.inf, -np.inf  # of the log times behind the stamps
         self.frames = FrameCounts()
-        recorded, self.sound = SensorStamps(), IncreasingStamps()
-        self.stamps, self.unsorted, messages, finite = NO_FAULTS, False, 0, 0
+        self.recorded: IncreasingStamps = SensorStamps()
+        self.stamps, self.unsorted, self.sound = NO_FAULTS, False, IncreasingStamps()
         self.unreadable = list[str]()
-        batches = raw_batches(log, topic, unreadable=self._name)
-        for samples in blocks(counted_frames(batches, self.frames)):
-            good = measured(samples.values)
-            recorded.see(samples.stamp_ns)
-            self.sound.see(samples.stamp_ns[good])
-            self._limits.see(samples.values[good], finite + np.arange(good.sum()))
-            messages, finite = messages + len(good), finite + int(good.sum())
-            lag_ns = samples.log_ns.astype(np.float64) - samples.stamp_ns
-            self._lag_ns = min(self._lag_ns[0], lag_ns.min()), max(self._lag_ns[1], lag_ns.max())
-        self.recorded: IncreasingStamps = recorded
-        self.jumps, self._period_ns = recorded.jumps, recorded.period_ns
-        self.counts = {"out_of_order": 0, "duplicated": 0, "missing": 0, "not_finite": messages - finite, "saturated": 0}
-        if not recorded.sound:
-            self._hold_stamps()
+        self._cutter, self._kept = BlockCutter(), KeptBlocks()
+        if read:
+            _read([self])
 
-    def _name(self, unreadable: str) -> None:
+    def add(self, batch: ImuBatch) -> None:
+        """Add the next messages."""
+        self.frames.add(batch)
+        for samples in self._cutter.add(batch):
+            self._see(samples)
+
+    def _see(self, samples: Samples) -> None:
+        self._kept.add(samples)
+        good = measured(samples.values)
+        self._limits.see(samples.values[good], self.sound.count + np.arange(good.sum()))
+        self.recorded.see(samples.stamp_ns)
+        self.sound.see(samples.stamp_ns[good])
+        lag_ns = samples.log_ns.astype(np.float64) - samples.stamp_ns
+        self._lag_ns = min(self._lag_ns[0], lag_ns.min()), max(self._lag_ns[1], lag_ns.max())
+
+    def name(self, unreadable: str) -> None:
+        """Keep what is wrong with a message that is none of an IMU."""
         if len(self.unreadable) < MAX_NAMED:
             self.unreadable.append(unreadable)
+
+    def finish(self) -> None:
+        """Settle counts and order after the last message."""
+        for samples in self._cutter.rest():
+            self._see(samples)
+        assert isinstance(self.recorded, SensorStamps), "stamps are sorted below at the earliest"
+        self.jumps, self._period_ns = self.recorded.jumps, self.recorded.period_ns
+        lost = self.recorded.count - self.sound.count
+        self.counts = {"out_of_order": 0, "duplicated": 0, "missing": 0, "not_finite": lost, "saturated": 0}
+        if not self.recorded.sound:
+            self._hold_stamps()
 
     def __len__(self) -> int:
         return self.sound.count
@@ -88,7 +108,7 @@ class ImuSamples:
         return self.sound.steps.median() * 1e-9
 
     def _read(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Samples]:
-        return blocks(raw_batches(self._log, self._topic, start_ns, end_ns))
+        return self._kept.read(start_ns, end_ns) or blocks(raw_batches(self.log, self.topic, start_ns, end_ns))
 
     def _hold_stamps(self) -> None:
         """Reads all stamps into memory, and settles the order of the samples."""
@@ -166,6 +186,25 @@ class ImuSamples:
                 of[(of < a) | (samples.stamp_ns > last_ns[of])] = -1
                 for stretch in np.flatnonzero(np.bincount(of[of >= 0])).tolist():  # unlike `unique`, without masked arrays
                     yield stretch, samples.values[of == stretch]
+
+
+def read_imus(log: Log, topics: Sequence[str]) -> Iterator[ImuSamples]:
+    """Samples of some IMUs; each chunk is unpacked once for `READ_AT_ONCE` of them.
+
+    Raises:
+        LogError: as `ImuSamples`.
+    """
+    for first in range(0, len(topics), READ_AT_ONCE):
+        yield from _read([ImuSamples(log, topic, read=False) for topic in topics[first : first + READ_AT_ONCE]])
+
+
+def _read(imus: Sequence[ImuSamples]) -> Sequence[ImuSamples]:
+    of = {imu.topic: imu for imu in imus}
+    for topic, batch in batches_by_topic(imus[0].log, of, unreadable=lambda topic, what: of[topic].name(what)):
+        of[topic].add(batch)
+    for imu in imus:
+        imu.finish()
+    return imus
 
 
 def _ordered_by(log_ns: Int64[np.ndarray, " n"], t_ns: Int64[np.ndarray, " n"]) -> bool:

@@ -23,7 +23,7 @@ from imutool.inertial.stationary import Batch, Blocks, block_statistics, resting
 from imutool.log_info.clock import clocks, in_blocks
 from imutool.log_info.convention_report import QUATERNIONS, convention_warnings, conventions, lean_warnings, truth_warnings
 from imutool.log_info.imu_motion import ImuMotion
-from imutool.log_info.imu_samples import ImuSamples
+from imutool.log_info.imu_samples import ImuSamples, read_imus
 from imutool.log_info.pose_coverage import coverage, transforms
 from imutool.log_info.pose_imu_rotation import Agreement, sparse_warnings
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
@@ -50,9 +50,9 @@ CONVERTIBLE = {  # messages of which `convert` makes others
 def inspect(path: Location, *, check: bool = True, max_chunk: int | None = None) -> LogInfo:
     """Describe a log: topics, clocks, IMU defects and noise, coverage by the truth, warnings.
 
-    The sound part of a damaged log is described, and `losses` lists the rest. Every chunk is read once; without `check` only
-    chunks with IMU messages are read, and damage elsewhere may go unnoticed. A chunk of more
-    than `max_chunk` bytes counts as lost.
+    The sound part of a damaged log is described, and `losses` lists the rest. Each chunk is unpacked once to check it, and once
+    more if it holds IMU messages; without `check` only these are, and damage elsewhere may go unnoticed. A chunk of more than
+    `max_chunk` bytes counts as lost.
 
     Raises:
         ConfigError: the file cannot be opened.
@@ -79,8 +79,9 @@ def describe(log: RecoveredLog, *, check: bool) -> LogInfo:
     truths = [*_coverages(log, own)]
     turns = {truth.topic: _poses(log, truth.topic, true_poses) for truth in truths if check and own and own.is_read}
     imus, found = list[ImuInfo](), dict[str, Agreement | None]()
+    samples = read_imus(log, [topic.name for topic in every if topic.is_read])
     for topic in every:
-        info, agreements = _imu(log, topic, true_poses, turns if topic is own else {})
+        info, agreements = _imu(topic, next(samples) if topic.is_read else None, true_poses, turns if topic is own else {})
         imus, found = [*imus, info], found | agreements
     truths = [_against_gyro(truth, found.get(truth.topic)) for truth in truths]
     warnings = [f"{imu.topic}: {warning}" for imu in imus for warning in imu.warnings]
@@ -145,14 +146,13 @@ def _times(topic: Topic) -> tuple[str | UnsetType, list[str] | UnsetType, str | 
 
 
 def _imu(
-    log: Log, topic: Topic, truth: Truth | None, poses: Mapping[str, Truth | None]
+    topic: Topic, imu: ImuSamples | None, truth: Truth | None, poses: Mapping[str, Truth | None]
 ) -> tuple[ImuInfo, dict[str, Agreement | None]]:
     """Defects, rest and noise of an IMU, and its agreement with poses; only a warning if its encoding is unknown."""
     derived_from = topic.metadata.get(DERIVED_KEY, UNSET)
-    if not topic.is_read:
+    if imu is None:
         warnings = [f"encoding {topic.message_encoding!r} is not read"]
         return ImuInfo(topic=topic.name, warnings=warnings, derived_from=derived_from), {}
-    imu = ImuSamples(log, topic.name)
     motion = ImuMotion(imu.sound.steps.median(), poses)
 
     stuck = Stuck()

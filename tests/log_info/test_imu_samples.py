@@ -7,13 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from support.imu_defects import batch_of, late, pick, repeated, with_values, write_log
 
-from imutool.log_info import clock
+from imutool.log_info import clock, kept_blocks
 from imutool.log_info.imu_samples import ImuSamples
 from imutool.log_info.inspection import inspect
 from imutool.log_info.report import Interval
+from imutool.mcap_io.codec import records, schemas
 from imutool.mcap_io.codec.decode import ImuBatch
+from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
@@ -83,3 +86,34 @@ def test_memory_does_not_grow_with_the_samples(tmp_path: Path, monkeypatch: pyte
         write(Recording("log", moving(count)), tmp_path / f"{count}.mcap")
         peaks.append(peak_bytes(tmp_path / f"{count}.mcap"))
     assert peaks[1] - peaks[0] < MAX_BYTES * 4 * COUNT
+
+
+def write_imus(path: Path, count: int = 10_000, imus: int = 3) -> None:
+    """IMUs side by side in every chunk, each with its own noise."""
+    payloads = [encode_imu(imu.t_ns, imu.gyro + k, imu.accel, f"imu{k}") for k, imu in enumerate([moving(count)] * imus)]
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        kind = writer.register_schema(schemas.IMU, "ros2msg", schemas.definition(schemas.IMU).encode())
+        ids = [writer.register_channel(f"/imu{k}", "cdr", kind) for k in range(imus)]
+        for n, t_ns in enumerate(moving(count).t_ns.tolist()):
+            for channel, payload in zip(ids, payloads, strict=True):
+                writer.add_message(channel, t_ns, payload[n].tobytes(), t_ns, n)
+        writer.finish()
+
+
+def no_file(**_: object) -> None:
+    raise OSError("No usable temporary directory found")
+
+
+def test_a_chunk_is_unpacked_once_for_all_imus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_imus(tmp_path / "log.mcap")
+    unpack, count = records.unpack, [0]
+    monkeypatch.setattr(records, "unpack", lambda *a, **k: count.__setitem__(0, count[0] + 1) or unpack(*a, **k))
+    found = inspect(tmp_path / "log.mcap")
+    with Log(tmp_path / "log.mcap") as log:
+        assert count[0] == 2 * len(log.index.blocks)  # to check it, and to read the IMUs; it was 7
+    monkeypatch.setattr(kept_blocks.tempfile, "TemporaryFile", no_file)
+    assert inspect(tmp_path / "log.mcap") == found, "without a temporary file the log is read again"
+    assert count[0] > 4 * len(log.index.blocks)
+    assert [imu.samples for imu in found.imu] == [10_000] * 3

@@ -56,7 +56,7 @@ def test_messages_of_many_small_chunks_are_decoded_together(foreign: Foreign, fl
     with Log(foreign(flight, layout)) as log:
         one_by_one = [rows for _, rows in log.rows(["/imu/data"])]
         cut_up = [rows.where(slice(n, n + 1)) for rows in one_by_one for n in range(len(rows.sequence))]
-        together = list(messages.joined(iter(cut_up)))
+        together = [rows for _, rows in messages.joined(("/imu/data", rows) for rows in cut_up)]
     assert len(together) < len(cut_up) == 900
     assert all(rows.payload.size <= 2 * messages.BATCH_BYTES for rows in together)
     for column in range(len(messages.Rows._fields) - 1):

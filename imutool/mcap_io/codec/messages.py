@@ -6,6 +6,7 @@ A log holds millions of messages, so they go through numpy instead of the classe
 from __future__ import annotations
 
 import struct
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from itertools import pairwise
 from typing import NamedTuple
@@ -225,21 +226,20 @@ def columns(heads: Shaped[np.ndarray, " n"], payload: UInt8[np.ndarray, "n L"]) 
     return Rows(heads["channel"].copy(), signed(heads["log_time"]), publish_time, heads["sequence"].copy(), payload)
 
 
-def joined(parts: Iterable[Rows]) -> Iterator[Rows]:
-    """Rows of small chunks as longer stretches of messages of equal size."""
-    waiting: list[Rows] = []
-    waiting_bytes = 0
-    for rows in parts:
-        if waiting and waiting[-1].payload.shape[1] != rows.payload.shape[1]:
-            yield _concatenated(waiting)
-            waiting, waiting_bytes = [], 0
-        waiting.append(rows)
-        waiting_bytes += rows.payload.size
-        if waiting_bytes >= BATCH_BYTES:
-            yield _concatenated(waiting)
-            waiting, waiting_bytes = [], 0
-    if waiting:
-        yield _concatenated(waiting)
+def joined(parts: Iterable[tuple[str, Rows]]) -> Iterator[tuple[str, Rows]]:
+    """Rows of small chunks as longer stretches of messages of equal size, by topic."""
+    waiting = dict[str, list[Rows]]()
+    size = Counter[str]()
+    for topic, rows in parts:
+        if (of := waiting.setdefault(topic, [])) and of[-1].payload.shape[1] != rows.payload.shape[1]:
+            yield topic, _concatenated(of)
+            waiting[topic], size[topic] = (of := []), 0
+        of.append(rows)
+        size[topic] += rows.payload.size
+        if size[topic] >= BATCH_BYTES:
+            yield topic, _concatenated(waiting.pop(topic))
+            size[topic] = 0
+    yield from ((topic, _concatenated(of)) for topic, of in waiting.items() if of)
 
 
 def _concatenated(parts: list[Rows]) -> Rows:

@@ -38,9 +38,8 @@ CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, unpacked size, CRC, length o
 USUAL_HEAD = struct.Struct("<BQQQQII4sQ")  # of a chunk record up to its data, where the compression's name has four letters
 FOOTER_SIZE = HEAD.size + 20
 COMPRESSIONS = {"none": "", "zstd": "zstd", "lz4": "lz4"}
-PACKINGS = frozenset(COMPRESSIONS.values())
 ZSTD_LEVEL = 1  # 1.24 GB/s and 1.08x on the mixed log of the notes, where level 3 gave 0.29 GB/s and 1.24x
-MAX_CHUNK = 1 << 28  # bytes, packed and unpacked; writers use 1 MiB, or one message that is larger
+PIECE, MAX_CHUNK = 16 << 20, 1 << 28  # bytes unpacked at once of lz4, and of a chunk; writers use 1 MiB, or a larger message
 
 
 def build(record: McapRecord) -> bytes:
@@ -137,7 +136,7 @@ def unpack(
         raise LogError(
             f"the chunk at byte {offset} says it unpacks to {head.size} bytes", expected=f"at most {max_chunk} (`max_chunk`)"
         )
-    if head.compression not in PACKINGS:
+    if head.compression not in COMPRESSIONS.values():
         raise LogError(f"the chunk at byte {offset} is compressed with {head.compression!r}", expected="zstd, lz4 or none")
     try:
         data = _decompress(head.compression, memoryview(record)[head.data_at :], head.size)
@@ -177,12 +176,17 @@ def _decompress(compression: str, packed: memoryview, size: int) -> bytes | memo
         return data
     if compression == "lz4":
         context = lz4.frame.create_decompression_context()  # `LZ4FrameDecompressor` would copy the packed bytes first
-        data, read, ended = lz4.frame.decompress_chunk(context, packed, max_length=size)
-        if ended and read < len(packed) and len(data) < size:
+        part, read, ended = lz4.frame.decompress_chunk(context, packed, max_length=min(size, PIECE))  # has it twice in memory
+        out = bytearray(part) if size > PIECE else part
+        while part and not ended and len(out) < size:
+            part, count, ended = lz4.frame.decompress_chunk(context, packed[read:], max_length=min(PIECE, size - len(out)))
+            out += part
+            read += count
+        if ended and read < len(packed) and len(out) < size:
             return bytes(lz4.frame.LZ4FrameFile(BytesIO(packed)).read(size + 1))
         if not ended and lz4.frame.decompress_chunk(context, packed[read:], max_length=1)[0]:
             raise ValueError(f"the lz4 frame goes on beyond the chunk's {size} bytes")
-        return data
+        return memoryview(out)
     return packed
 
 

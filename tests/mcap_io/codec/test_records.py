@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from imutool.errors import LogError
+from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.records import chunk_head, keep_buffers, pack, unpack
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Imu, Recording
@@ -51,3 +54,30 @@ def test_threads_unpack_their_own_chunks_at_once(compression: str) -> None:
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda chunk: bytes(unpack(chunk, 0)), 8 * chunks))
     assert found == 8 * contents
+
+
+def unpacked(data: bytes, packed: bytes) -> bytes | str:
+    try:
+        return bytes(unpack(chunk_head(data, packed, "lz4", 0, 1) + packed, 0))
+    except LogError as error:
+        return str(error)
+
+
+def test_a_large_lz4_chunk_comes_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = np.random.default_rng(1).integers(0, 4, 1 << 20, np.uint8).tobytes()
+    frame, half = pack("lz4")(data), len(data) // 2
+    frames = {
+        "one": frame,
+        "two": pack("lz4")(data[:half]) + pack("lz4")(data[half:]),
+        "cut": frame[: len(frame) // 2],
+        "too long": pack("lz4")(data + b"more"),
+    }
+    at_once = {name: unpacked(data, packed) for name, packed in frames.items()}
+    assert at_once["one"] == at_once["two"] == data
+    monkeypatch.setattr(records, "PIECE", 100_000)
+    assert {name: unpacked(data, packed) for name, packed in frames.items()} == at_once
+    tracemalloc.start()
+    unpack(chunk_head(data, frame, "lz4", 0, 1) + frame, 0)
+    peak = tracemalloc.get_traced_memory()[1] - len(frame)
+    tracemalloc.stop()
+    assert peak < 1.5 * len(data)  # it was twice its size
