@@ -1,4 +1,7 @@
-"""Initial bias measured at rest: rate zero, specific force g along an unknown direction."""
+"""Initial bias measured at rest.
+
+True rate zero, specific force g along an unknown direction.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,6 @@ from imutool.bias_start.initial_bias import (
     training_source,
 )
 from imutool.bias_start.prior_width import MAX_DEVIATIONS, BiasPrior, supported_std, widened
-from imutool.bias_start.stretches import answered_twice
 from imutool.errors import DataError
 from imutool.inertial.inertial_filter import MIN_FORCE_M_S2
 from imutool.inertial.innovations import MIN_DRIVEN_M_S, SURPRISING, innovations
@@ -200,7 +202,6 @@ def stops_in(samples: Samples) -> list[tuple[float, float]]:
     return [(float(t_s[first]), float(t_s[last - 1])) for first, last in stops]
 
 
-@answered_twice
 def refuted_stops(samples: Samples, model: BiasModel) -> tuple[Vector6, Vector6] | None:
     """Bias and its deviation by gravity in motion, where this refutes the first stop.
 

@@ -7,15 +7,14 @@ stretch, and counts as at most `MAX_GAP_S`.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import wraps
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
 from imutool.array_types import Bool, Float64, Int64
-from imutool.bias.model import GAP_S, BiasModel
+from imutool.bias.model import GAP_S
 from imutool.cleaning import rows
 from imutool.cleaning.rules.saturation import at_limit
 from imutool.cleaning.rules.stuck import STILL_GYRO, failed_gyro, repeated
@@ -38,8 +37,6 @@ NOT_FINITE, OUT_OF_RANGE, ZERO_FORCE = "not_finite", "out_of_range", "zero_force
 
 logger = logging.getLogger(__name__)
 Rows3 = Float64[np.ndarray, "n 3"]
-Answer = TypeVar("Answer")
-SampleColumns = tuple[Float64[np.ndarray, " _"], Float64[np.ndarray, "_ 3"], Float64[np.ndarray, "_ 3"]]  # with times in s
 
 
 class Stretch(NamedTuple):
@@ -277,22 +274,3 @@ WORDS = {
 def described(left_out: Mapping[str, int]) -> str:
     """Left-out samples in words."""
     return ", ".join(f"{count} {WORDS[reason]}" for reason, count in left_out.items())
-
-
-def answered_twice(function: Callable[[SampleColumns, BiasModel], Answer]) -> Callable[[SampleColumns, BiasModel], Answer]:
-    """The function, which computes one answer where it is asked the same twice in a row.
-
-    The start and the check of the fit ask the same of a log of a minute, and with `smooth` of any log.
-    """
-    last: list[tuple[SampleColumns, BiasModel, Answer]] = []
-
-    @wraps(function)
-    def asked(samples: SampleColumns, model: BiasModel) -> Answer:
-        for before, of, answer in (last.pop() for _ in last[:1]):
-            if of is model and all(map(np.array_equal, before, samples)):
-                return answer
-        answer = function(samples, model)
-        last[:] = [(samples, model, answer)]
-        return answer
-
-    return asked

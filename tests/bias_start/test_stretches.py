@@ -18,7 +18,7 @@ from imutool.bias.model import BiasModel
 from imutool.bias.model_file import load
 from imutool.bias_start.correction import OnlineDebiaser, apply_with_std
 from imutool.bias_start.initial_bias import tracked_from_prior
-from imutool.bias_start.stretches import Sieve, StretchClock, answered_twice, measured, measured_recording, read_stretches
+from imutool.bias_start.stretches import Sieve, StretchClock, measured, measured_recording, read_stretches
 from imutool.debiasing import DebiasedBlock, DebiasReport, debias
 from imutool.errors import ConfigError, DataError, ImutoolError, LogError
 from imutool.evaluation import evaluate
@@ -313,14 +313,3 @@ def test_a_sensor_at_rest_whose_digits_are_coarser_than_its_noise_is_not_stuck()
     gyro[520:, 0] -= 1e-3
     resting = replace(recording, imu=replace(recording.imu, gyro=gyro, accel=accel))
     assert measured_recording(resting).imu is resting.imu
-
-
-def test_the_same_question_is_computed_once_and_another_one_anew() -> None:
-    asked = list[float]()
-    count = answered_twice(lambda samples, model: asked.append(float(samples[0].sum())) or len(asked))
-    model, samples = static.Model(), (np.arange(5.0), np.zeros((5, 3)), np.ones((5, 3)))
-    again = tuple(column.copy() for column in samples)
-    assert [count(samples, model), count(again, model), count(samples, model)] == [1, 1, 2], "kept for one question"
-    other = samples[0], samples[1], 2.0 * samples[2]
-    assert [count(other, model), count(other, static.Model()), count(samples, model)] == [3, 4, 5]
-    assert count(tuple(column[:4] for column in samples), model) == 6
