@@ -156,7 +156,7 @@ def _plainer(effect: Effect, theta: Theta, *, poses: bool) -> Mapping[str, tuple
     name = effect.name
     if name == "clock_jump":
         return {"clock_offset": ([0], [theta[1]]), "clock_skew": ([0], [theta[1] / max(2.0 * theta[0], 1.0)])}
-    if name == LOW_PASSES[1]:
+    if name == LOW_PASSES[1] or effect.key == f"{LOW_PASSES[0]}:gyro":
         lag_s = low_pass.Design.of(effect, theta).lag_s
         of_both = {"clock_offset": ([0], [-lag_s]), "low_pass": ([0], [1.0 / (2.0 * np.pi * lag_s)])}
         return of_both if len(effect.sensors) > 1 else {"gyro_delay": ([0], [lag_s])} if effect.sensors[0] == "gyro" else {}
@@ -215,8 +215,9 @@ def unidentified(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> It
 
 
 def for_noise(effects: Sequence[Effect]) -> list[Effect]:
-    """Effects whose residual gives the noise: further steps or orders would leave too little."""
-    return [effect for effect in effects if effect.name != LOW_PASSES[1] and effect.variant not in (SHARED, STEP, *ONCE_MORE)]
+    """Effects whose residual gives the noise: further steps, or other low-passes, would leave too little."""
+    plain = (effect for effect in effects if effect.lagless is None or effect.key == LOW_PASSES[0])
+    return [effect for effect in plain if effect.variant not in (SHARED, STEP, *ONCE_MORE)]
 
 
 def exclude_each_other(a: Effect, b: Effect) -> bool:
