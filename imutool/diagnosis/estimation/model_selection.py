@@ -220,7 +220,7 @@ class _Search(Trial):
             rivals = self.rivals(base.keys.index(effect.key), base).values()  # a name that leaves no more says more
             score = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
             base = next((trial for trial in rivals if score(trial) < score(base)), base)
-        base = with_delay_of_accel(with_form_of_low_pass(base, self.named), self.named)
+        base = with_delay_of_accel(with_form_of_low_pass(base, self.named), self.named, complete=True)
         base = with_filter_of_each_sensor(base, self.named)
         base = with_steady_clock(base, self.named, self.candidates.starts)
         base = with_plainer_effects(base, self.named)
