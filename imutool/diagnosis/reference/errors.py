@@ -113,8 +113,8 @@ def _away_from(runs: Sequence[tuple[float, float]], logs: Sequence[WhitenedImu],
         before.append(residual[pair.held_out, 3:])
         after.append(residual[away, 3:])
         seconds += float(pair.held_out.sum()) * pair.period_s
-    rms = (float(np.sqrt((np.concatenate(each) ** 2).mean())) for each in (before, after))
-    return HeldOut(*rms, ASCII_UNITS["accel"], round(seconds, 1))
+    rms_before, rms_after = (float(np.sqrt((np.concatenate(each) ** 2).mean())) for each in (before, after))
+    return HeldOut(rms_before, rms_after, ASCII_UNITS["accel"], round(seconds, 1))
 
 
 def _is_shock(log: WhitenedImu, runs: Sequence[tuple[float, float]]) -> bool:
