@@ -188,7 +188,10 @@ def leaves_slow_motion(found: Fit, sensor: str, squares: float) -> bool:
 
 
 def slow_squares(found: Fit, sensor: str) -> float:
-    """Squares of white residuals of a sensor above noise, below the frequency `motion_hz` up to which a body moves."""
+    """Squares of white residuals of a sensor above noise, up to the frequency of a body.
+
+    That is `motion_hz`.
+    """
     total = np.zeros(found.logs[0].pair.columns)
     for log, r, b in zip(found.logs, found.residuals, found.bias, strict=True):
         settings, residual = log.pair.settings, r - log.constants * b

@@ -221,7 +221,7 @@ def unidentified(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> It
 
 
 def for_noise(effects: Sequence[Effect]) -> list[Effect]:
-    """Effects whose residual gives the noise: further steps, or other low-passes, would leave too little."""
+    """Effects whose residual gives the noise: further steps and filters leave too little."""
     plain = (effect for effect in effects if effect.lagless is None or effect.key == LOW_PASSES[0])
     return [effect for effect in plain if effect.variant not in (SHARED, STEP, *ONCE_MORE)]
 

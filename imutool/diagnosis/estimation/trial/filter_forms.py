@@ -106,7 +106,7 @@ def with_form_of_resonance(base: Fit, named: Sequence[Effect]) -> Fit:
 
 
 def with_delay_of_accel(base: Fit, named: Sequence[Effect], *, complete: bool = False) -> Fit:
-    """Fit with a delay of the accelerometer for a filter of it that is not clearly better (BIC).
+    """Fit with a delay of the accelerometer for a filter that is not clearly better (BIC).
 
     A late accelerometer is a clock that is late, and a gyro that is ahead of it. One alone of these two explains little, so
     that the search finds the low-pass of this lag, or of slow motion a hysteresis. A hysteresis, and against a

@@ -24,7 +24,9 @@ MIN_LAG_S = 0.003  # of a filter, from where its fit starts
 
 
 def with_filters_by_poses(base: Fit, named: Sequence[Effect]) -> Fit:
-    """Fit with a low-pass of one sensor, or of each, for other lags next to poses, if clearly better (BIC).
+    """Fit with a low-pass of one sensor, or of each, for other lags next to poses.
+
+    It has to be clearly better (BIC).
 
     A clock that follows the slower sensor explains most of its lag, and is found first. What it leaves has many other names: a
     gyro ahead of it, a clock that wanders, smoothed poses, scales.

@@ -74,7 +74,7 @@ def below_model_error(
 
 
 def is_taken_back(found: Fit, low_pass: Effect) -> bool:
-    """Whether a gyro that is ahead takes most of the lag of its low-pass back, as no filter does."""
+    """Whether a gyro that is ahead takes most of its low-pass's lag back, as no filter does."""
     ahead_s = -sum(float(theta[0]) for effect, theta in found.chosen if effect.key == "gyro_delay")
     own_s = next(Design.of(low_pass, theta).lag_s for effect, theta in found.chosen if effect is low_pass)
     return "gyro" in low_pass.sensors and ahead_s > TAKEN_BACK * own_s
