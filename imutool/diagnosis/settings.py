@@ -228,6 +228,7 @@ class ReferenceSettings(Settings, frozen=True):
     max_of_time: Share = 0.15  # that such intervals may take; more is another misfit
     max_intervals: Count = 8  # with a wrong reference that are named
     longest_s: Positive = 4.0  # of one interval
+    both_share: Share = 0.9  # of the squares in such intervals, that both sensors have to show
     quiet_chi_square: Positive = 1.1  # reduced: up to it all the rest is noise
     join_s: Positive = 0.6  # intervals closer than this are joined
     turned_block_s: Positive = 5.0  # of a mean: slower than poses follow the gyro (EuRoC V1_01)

@@ -37,6 +37,7 @@ from imutool.diagnosis.estimation.trial.filter_forms import (
     with_form_of_resonance,
     without_unseen_low_pass,
 )
+from imutool.diagnosis.estimation.trial.filters_by_poses import LAGS_BY_POSES, with_filters_by_poses
 from imutool.diagnosis.estimation.trial.model_error import LowPassError
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.trial.verdicts import Trial
@@ -110,6 +111,8 @@ def _grown(first: _Search, base: Fit, unnamed: Sequence[Effect], later: Sequence
                 better = with_delay_of_accel(better, search.named)
             if better.chosen[-1][0].name in LAGS:
                 better = with_filter_of_each_sensor(better, search.named)
+            if better.chosen[-1][0].name in LAGS_BY_POSES:
+                better = with_filters_by_poses(better, search.named)
             better = with_form_of_resonance(better, search.named)
             before, base = base.objective, search.pruned(search.exchanged(search.with_always(better)))
         elif waiting:
@@ -217,7 +220,7 @@ class _Search(Trial):
             rivals = self.rivals(base.keys.index(effect.key), base).values()  # a name that leaves no more says more
             score = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
             base = next((trial for trial in rivals if score(trial) < score(base)), base)
-        base = with_delay_of_accel(with_form_of_low_pass(base, self.named), self.named)
+        base = with_delay_of_accel(with_form_of_low_pass(base, self.named), self.named, complete=True)
         base = with_filter_of_each_sensor(base, self.named)
         base = with_steady_clock(base, self.named, self.candidates.starts)
         base = with_plainer_effects(base, self.named)

@@ -14,6 +14,7 @@ from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.estimation.noise_estimate import slow_squares
 from imutool.diagnosis.estimation.significance import bic, parameter_cost
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.recording import GRAVITY_M_S2
@@ -131,7 +132,10 @@ def with_steady_clock(base: Fit, named: Sequence[Effect], starts: Starts) -> Fit
 
 
 def with_plainer_effects(base: Fit, named: Sequence[Effect]) -> Fit:
-    """Fit with the plainer of two effects where the other is not clearly better (BIC)."""
+    """Fit with the plainer of two effects where the other is not clearly better (BIC).
+
+    A filter of one sensor has to explain more than its lag does, by more than it leaves: else it is of another form.
+    """
     poses = any(log.pair.band_hz is not None for log in base.logs)
     for complex_one, theta in base.chosen:
         sizes = _plainer(complex_one, theta, poses=poses)
@@ -139,6 +143,8 @@ def with_plainer_effects(base: Fit, named: Sequence[Effect]) -> Fit:
         plainer = [effect for effect in named if effect.key in sizes and effect.key not in base.keys]
         parts = [(with_free(e, sizes[e.name][0], complex_one.sensors), np.array(sizes[e.name][1])) for e in plainer]
         margin = base.logs[0].pair.settings.search.clearly_better * max(1.0, base.reduced_chi_square)
+        if parts and complex_one.lagless is not None and len(complex_one.sensors) == 1:
+            margin = max(margin, slow_squares(base, complex_one.sensors[0]))
         limits = [bic(base) + margin - parameter_cost(base, (*rest, part)) for part in parts]
         trials = [fit(base.logs, (*rest, part), near=base, give_up_above=at) for part, at in zip(parts, limits, strict=True)]
         best = min(trials, key=bic, default=base)
@@ -156,7 +162,7 @@ def _plainer(effect: Effect, theta: Theta, *, poses: bool) -> Mapping[str, tuple
     name = effect.name
     if name == "clock_jump":
         return {"clock_offset": ([0], [theta[1]]), "clock_skew": ([0], [theta[1] / max(2.0 * theta[0], 1.0)])}
-    if name == LOW_PASSES[1]:
+    if name == LOW_PASSES[1] or (name == LOW_PASSES[0] and effect.sensors == ("gyro",)):
         lag_s = low_pass.Design.of(effect, theta).lag_s
         of_both = {"clock_offset": ([0], [-lag_s]), "low_pass": ([0], [1.0 / (2.0 * np.pi * lag_s)])}
         return of_both if len(effect.sensors) > 1 else {"gyro_delay": ([0], [lag_s])} if effect.sensors[0] == "gyro" else {}
@@ -215,8 +221,9 @@ def unidentified(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> It
 
 
 def for_noise(effects: Sequence[Effect]) -> list[Effect]:
-    """Effects whose residual gives the noise: further steps or orders would leave too little."""
-    return [effect for effect in effects if effect.name != LOW_PASSES[1] and effect.variant not in (SHARED, STEP, *ONCE_MORE)]
+    """Effects whose residual gives the noise: further steps and filters leave too little."""
+    plain = (effect for effect in effects if effect.lagless is None or effect.key == LOW_PASSES[0])
+    return [effect for effect in plain if effect.variant not in (SHARED, STEP, *ONCE_MORE)]
 
 
 def exclude_each_other(a: Effect, b: Effect) -> bool:

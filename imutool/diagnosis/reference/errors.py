@@ -42,37 +42,29 @@ Vector = Float64[np.ndarray, "3"]
 
 
 def reference_errors(logs: Sequence[WhitenedImu]) -> tuple[list[Finding], tuple[Located, ...]]:
-    """Intervals of a wrong reference, as a finding and locations; of shocks their locations."""
-    if len(logs) != 1:
+    """Intervals of a wrong reference, as a finding and locations; of shocks their locations.
+
+    Poses that jump part a recording into stretches. Of several recordings nothing is said.
+    """
+    if len({log.pair.name for log in logs}) != 1 or not any(log.rows("all").any() for log in logs):
         return [], ()
-    (log,), settings = logs, logs[0].pair.settings.reference
+    settings = logs[0].pair.settings.reference
     block_s, p_value = settings.block_s, settings.p_value
-    rows = log.rows("all")
-    if not rows.any():
-        return [], ()
-    t_s = log.pair.stamp_s[:: log.whiten.every][rows]
-    white = log.whiten(log.pair.real - expected(log.pair, ()))[rows]
-    constant = log.constants[rows]
-    white = (
-        white - np.median(white / np.where(constant == 0, 1.0, constant), axis=0) * constant
-    )  # a mean would carry the misfit
+    t_s, white = (np.concatenate(each) for each in zip(*map(_white_misfit, logs), strict=True))
     block = np.floor((t_s - t_s[0]) / block_s).astype(int)
     count = np.maximum(np.bincount(block), 1)
     power = np.stack([np.bincount(block, weights=(white[:, k : k + 3] ** 2).sum(axis=1)) for k in (0, 3)])
     loud = chi2.logsf(power, 3 * count) < np.log(p_value)
     runs = _runs(loud.any(axis=0), float(t_s[0]), settings)
-    inside = (
-        np.any([(t_s >= a - block_s) & (t_s <= b + block_s) for a, b in runs], axis=0) if runs else np.zeros(len(t_s), bool)
-    )
-    outside = white[~inside]
-    at = t_s[0] + block_s * np.arange(len(count))
-    both = all(loud[:, (at >= a - 1e-6) & (at < b)].any(axis=1).all() and b - a <= settings.longest_s for a, b in runs)
+    if not runs or not _of_both_sensors(runs, t_s[0] + block_s * np.arange(len(count)), power, loud, settings):
+        return [], ()
+    inside = np.any([(t_s >= a - block_s) & (t_s <= b + block_s) for a, b in runs], axis=0)
     few = len(runs) <= settings.max_intervals and inside.mean() <= settings.max_of_time
-    if not runs or not both or not few or (outside**2).mean() > settings.quiet_chi_square:
+    if not few or (white[~inside] ** 2).mean() > settings.quiet_chi_square:
         return [], ()
     excess = (white[inside] ** 2).sum() - 6.0 * inside.sum()
     share = float(np.clip(excess / max(float((white**2).sum() - 6.0 * len(white)), 1e-300), 0.0, 1.0))
-    shock = _is_shock(log, runs)
+    shock = any(_is_shock(log, runs) for log in logs)
     own = "no regime: shocks of the recording" if shock else "no regime: the reference's own moments"
     places = tuple(
         Located(signal, axes or AXES, tuple(runs), own, share, p_value, extent="intermittent")
@@ -84,15 +76,45 @@ def reference_errors(logs: Sequence[WhitenedImu]) -> tuple[list[Finding], tuple[
     length = float(np.mean([b - a for a, b in runs]))
     parameters = {"length": Estimate(length, block_s / np.sqrt(6.0 * len(runs)) + 0.1 * length, "s")}
     parameters |= {f"t_{k}": Estimate(a, block_s, "s") for k, (a, _) in enumerate(runs)}
-    residual = log.pair.real - expected(log.pair, ())
-    residual = residual - np.median(residual, axis=0)
-    held_rows = log.pair.held_out
-    t_all = log.pair.stamp_s
-    away = held_rows & ~np.any([(t_all >= a - block_s) & (t_all <= b + block_s) for a, b in runs], axis=0)
-    before, after = (float(np.sqrt((residual[mask, 3:] ** 2).mean())) for mask in (held_rows, away))
-    held_out = HeldOut(before, after, ASCII_UNITS["accel"], round(float(held_rows.sum()) * log.pair.period_s, 1))
+    held_out = _away_from(runs, logs, block_s)
     finding = Finding("reference_error", "both", share, p_value, p_value, parameters, "the reference is wrong there", held_out)
     return [finding], places
+
+
+def _white_misfit(log: WhitenedImu) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 6"]]:
+    """Times of a log's rows, and white residuals of no effect without their constants."""
+    rows = log.rows("all")
+    white, constant = log.whiten(log.pair.real - expected(log.pair, ()))[rows], log.constants[rows]
+    middle = np.median(white / np.where(constant == 0, 1.0, constant), axis=0)  # a mean would carry the misfit
+    return log.pair.stamp_s[:: log.whiten.every][rows], white - middle * constant
+
+
+def _of_both_sensors(
+    runs: Sequence[tuple[float, float]],
+    at_s: Float64[np.ndarray, " b"],
+    power: Float64[np.ndarray, "2 b"],
+    loud: np.ndarray,
+    settings: ReferenceSettings,
+) -> bool:
+    """Whether both sensors show short intervals that hold most of the misfit: at the edge of one, one sensor may be loud."""
+    parts = [(at_s >= a - 1e-6) & (at_s < b) for a, b in runs]
+    both = [part for part in parts if loud[:, part].any(axis=1).all()]
+    shown, whole = (sum(float(power[:, part].sum()) for part in some) for some in (both, parts))
+    return shown > settings.both_share * whole and all(b - a <= settings.longest_s for a, b in runs)
+
+
+def _away_from(runs: Sequence[tuple[float, float]], logs: Sequence[WhitenedImu], block_s: float) -> HeldOut:
+    """Misfit of the accelerometer on held-out time, with and without some intervals."""
+    before, after, seconds = [], [], 0.0
+    for pair in (log.pair for log in logs):
+        residual = pair.real - expected(pair, ())
+        residual, t_s = residual - np.median(residual, axis=0), pair.stamp_s
+        away = pair.held_out & ~np.any([(t_s >= a - block_s) & (t_s <= b + block_s) for a, b in runs], axis=0)
+        before.append(residual[pair.held_out, 3:])
+        after.append(residual[away, 3:])
+        seconds += float(pair.held_out.sum()) * pair.period_s
+    rms_before, rms_after = (float(np.sqrt((np.concatenate(each) ** 2).mean())) for each in (before, after))
+    return HeldOut(rms_before, rms_after, ASCII_UNITS["accel"], round(seconds, 1))
 
 
 def _is_shock(log: WhitenedImu, runs: Sequence[tuple[float, float]]) -> bool:
@@ -107,6 +129,8 @@ def _is_shock(log: WhitenedImu, runs: Sequence[tuple[float, float]]) -> bool:
         return False
     fast = sosfiltfilt(butter(2, own_hz, "high", fs=rate_hz, output="sos"), pair.real, axis=0)
     inside = np.any([(pair.stamp_s >= a) & (pair.stamp_s <= b) for a, b in runs], axis=0)
+    if not inside.any():
+        return False
     misfit = pair.real - expected(pair, ())
     misfit = misfit - np.median(misfit, axis=0)
     shaken, missed = ((x[inside] ** 2).mean(axis=0) - (x[~inside] ** 2).mean(axis=0) for x in (fast, misfit))

@@ -8,12 +8,13 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from scipy.signal import butter, sosfilt
+from scipy.signal import butter, iirnotch, lfilter, sosfilt
 from scipy.special import gammaincc
 from scipy.stats import chi2
 from support import planted
 from support.seeds import seeds
 
+from imutool.diagnosis.diagnose import candidates_for
 from imutool.diagnosis.estimation import model_selection
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.estimation.aligned_log import Pair
@@ -33,6 +34,7 @@ from imutool.processes.forked import Forked
 from imutool.sensor import catalogue
 from imutool.sensor.effects import clock_wander, gyro_bias_drift, gyro_bias_step, gyro_scale
 from imutool.sensor.samples import IdealMotion
+from imutool.units import SENSORS
 
 SURE = 4.0
 DURATION_S = 20.0
@@ -359,6 +361,49 @@ def test_a_late_accelerometer_is_no_hysteresis_and_what_a_delay_leaves_is_no_del
         assert both == {name: pytest.approx(-LATE_S, abs=1e-3) for name in ("clock_offset", "gyro_delay")}
     else:
         assert list(both) == ["accel_hysteresis"]
+
+
+def test_a_second_order_filter_of_the_accelerometer_that_shows_its_lag_alone_is_that_lag() -> None:
+    late_s, logs = 0.003, [planted.weighed(planted.pair(trembling(6.0), {"clock_offset": [-0.003], "gyro_delay": [-0.003]}))]
+    (filtered,) = (one for one in planted.catalogue() if one.key == "second_order_low_pass:accel")
+    found = with_delay_of_accel(fit(logs, ((filtered, np.array([70.0, 0.7])),)), planted.catalogue())
+    both = {effect.name: float(theta[0]) for effect, theta in found.chosen}
+    assert both == {name: pytest.approx(-late_s, abs=2e-4) for name in ("clock_offset", "gyro_delay")}
+
+
+def by_poses(pair: Pair) -> Selection:
+    """What a recording's own poses show."""
+    known = replace(pair, band_hz=7.0)
+    return select_effects([planted.weighed(known)], candidates_for([known]))
+
+
+NO_FILTER = "low_pass", [math.inf]
+
+
+@pytest.mark.parametrize(
+    ("of_gyro", "of_accel", "late_s"),
+    [
+        (NO_FILTER, ("low_pass", [15.0]), 0.0),
+        (NO_FILTER, ("low_pass", [12.0]), 0.02),
+        (("low_pass", [20.0]), ("low_pass", [10.0]), 0.0),
+        (NO_FILTER, ("second_order_low_pass", [8.0, 0.7]), 0.0),
+    ],
+)
+def test_poses_show_the_filter_of_a_sensor(
+    of_gyro: tuple[str, list[float]], of_accel: tuple[str, list[float]], late_s: float
+) -> None:
+    """A clock that follows the slower sensor is found first, and had two to five wrong names with it."""
+    found = by_poses(through(trembling(6.0), of_gyro, of_accel, late_s))
+    each = zip(SENSORS, (of_gyro, of_accel), strict=True)
+    filters = {f"{name}:{sensor}": theta for sensor, (name, theta) in each if math.isfinite(theta[0])}
+    assert sorted(names(found)) == sorted([*filters, *(["clock_offset"] if late_s else [])])
+    assert all(sure(found, key, theta) for key, theta in filters.items())
+
+
+@pytest.mark.parametrize("effects", [{"clock_offset": [-0.01], "gyro_delay": [-0.01]}, {"gyro_delay": [0.004]}], ids="+".join)
+def test_poses_show_that_a_sensor_is_late_and_filters_nothing(effects: dict[str, list[float]]) -> None:
+    found = by_poses(planted.pair(trembling(3.0), effects))
+    assert sorted(names(found)) == sorted(effects)
 
 
 # ── log_p_value ──
@@ -822,6 +867,14 @@ def test_a_gyro_that_is_ahead_is_plainer_than_a_clock_and_a_filter() -> None:
     delay = next(of for of in planted.catalogue() if of.key == "gyro_delay")
     now = fit(logs, ((delay, np.array([-0.001])),))
     assert with_filter_of_each_sensor(now, planted.catalogue()) is now
+
+
+def test_a_notch_filter_of_the_gyro_is_no_low_pass_but_its_lag() -> None:
+    """Its loss near its frequency had the cut-off of a low-pass, and a gyro ahead of it."""
+    felt = trembling(9.0)
+    notched = lfilter(*iirnotch(12.0, 3.0, fs=planted.RATE_HZ), felt.gyro - felt.gyro[0], axis=0) + felt.gyro[0]
+    added = np.concatenate([notched - felt.gyro, np.zeros_like(felt.gyro)], axis=1)
+    assert names(asked(planted.pair(felt, added=added), beyond=False)) == ["gyro_delay"]
 
 
 def test_a_filter_of_each_sensor_that_shows_its_lag_alone_has_no_order_by_chance() -> None:

@@ -101,6 +101,23 @@ def test_a_blow_is_no_error_of_the_reference_and_a_jump_or_a_lost_motion_of_it_i
     assert all(abs(a - at) < 0.5 for (a, _), at in zip(places[0].intervals_s, BLOWS_S, strict=True))
 
 
+@pytest.mark.parametrize("alike", [True, False], ids=["both sensors", "the accelerometer alone at its end"])
+def test_poses_that_jump_have_a_wrong_interval_in_one_of_their_stretches(alike: bool) -> None:
+    """Of several stretches nothing was said, nor where one sensor alone shows the rim of an interval."""
+    felt, at_s, end_s = planted.rich(3, DURATION_S), 20.0, 22.0
+    rows = (felt.t_s >= at_s) & (felt.t_s < end_s)
+    wrong = np.where(rows[:, None], [0.3, -0.2, 0.4, 3.0, 2.0, -4.0], 0.0)
+    if not alike:
+        wrong[(felt.t_s >= end_s + 1.0) & (felt.t_s < end_s + 1.2), 3:] = 0.3
+    pair = planted.pair(felt, {}, 1, added=wrong)
+    parts = [felt.t_s < 0.5 * DURATION_S, felt.t_s > 0.5 * DURATION_S + 1.0]
+    names = "stamp_s", "real", "fitted", "held_out"
+    logs = [planted.weighed(replace(pair, **{name: getattr(pair, name)[part] for name in names})) for part in parts]
+    (finding,), places = reference_errors(logs)
+    assert finding.effect == "reference_error"
+    assert places[0].intervals_s[0] == pytest.approx((at_s, end_s), abs=0.3)
+
+
 def test_poses_that_are_turned_against_slow_motion_alone_are_wrong_by_that_rotation() -> None:
     (wrong,) = found(1.0, 0.0)
     assert wrong.effect == "reference_error"

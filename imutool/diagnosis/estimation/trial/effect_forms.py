@@ -63,15 +63,13 @@ def exponential(of_analog: Effect) -> Effect:
 def _of_low_pass(effect: Effect, *, exact: bool) -> list[Effect]:
     """Forms of a low-pass without a rate; another effect itself.
 
-    With `exact`, against a simulation, a low-pass may be of each sensor alone, or of another order.
+    A low-pass may be of each sensor alone. With `exact`, against a simulation, it may be of another order, too.
     """
     if effect.lagless is None:
         return [effect]
-    both, higher = analog(effect), HIGHER if ORDER in effect.parameters else ()
-    if not exact:
-        return [both]
+    both, first_order = analog(effect), ORDER in effect.parameters
     each = [both, *(of_one(both, sensor) for sensor in SENSORS)]
-    return [*each, *(of_order(form, order) for form in each for order in higher)]
+    return [*each, *(of_order(form, order) for form in each for order in HIGHER if exact and first_order)]
 
 
 def analog(effect: Effect) -> Effect:

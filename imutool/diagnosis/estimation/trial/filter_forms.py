@@ -10,8 +10,8 @@ from scipy.optimize import brentq
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
-from imutool.diagnosis.estimation.noise_estimate import leaves_slow_motion
-from imutool.diagnosis.estimation.observability import LOW_PASSES, beyond_the_band, exclude_each_other
+from imutool.diagnosis.estimation.noise_estimate import leaves_slow_motion, slow_squares
+from imutool.diagnosis.estimation.observability import LOW_PASSES, WANDER, beyond_the_band, exclude_each_other
 from imutool.diagnosis.estimation.significance import bic
 from imutool.diagnosis.estimation.trial.effect_forms import digital, exponential
 from imutool.diagnosis.estimation.whitening import WhitenedLog
@@ -53,7 +53,8 @@ def without_unseen_low_pass(base: Fit, named: Sequence[Effect]) -> Fit:
     """Fit with a clock offset for a low pass beyond the poses' band, which its delay shows."""
     offset = next((e for e in named if e.name == "clock_offset" and e.key not in base.keys), None)
     for k, (effect, theta) in enumerate(base.chosen):
-        if offset is not None and effect.name in LOW_PASSES and beyond_the_band(effect, theta, base.logs):
+        of_both = effect.name in LOW_PASSES and len(effect.sensors) == len(SENSORS)
+        if offset is not None and of_both and beyond_the_band(effect, theta, base.logs):
             delayed = offset, np.array([-Design.of(effect, theta).lag_s])  # far below its cut-off
             return fit(base.logs, (*base.chosen[:k], *base.chosen[k + 1 :], delayed), near=base)
     return base
@@ -104,11 +105,13 @@ def with_form_of_resonance(base: Fit, named: Sequence[Effect]) -> Fit:
     return base
 
 
-def with_delay_of_accel(base: Fit, named: Sequence[Effect]) -> Fit:
-    """Fit with a delay of the accelerometer for a clearly worse filter of it (BIC).
+def with_delay_of_accel(base: Fit, named: Sequence[Effect], *, complete: bool = False) -> Fit:
+    """Fit with a delay of the accelerometer for a filter that is not clearly better (BIC).
 
     A late accelerometer is a clock that is late, and a gyro that is ahead of it. One alone of these two explains little, so
-    that the search finds the low-pass of this lag, or of slow motion a hysteresis.
+    that the search finds the low-pass of this lag, or of slow motion a hysteresis. A hysteresis, and against a
+    simulation a first order, has one number, and stays unless it is clearly worse. What a `complete` fit leaves may be of a
+    filter of another form.
     """
     both = [of for key in ("clock_offset", "gyro_delay") for of in named if of.key == key and key not in base.keys]
     for k, (effect, theta) in enumerate(base.chosen):
@@ -116,8 +119,12 @@ def with_delay_of_accel(base: Fit, named: Sequence[Effect]) -> Fit:
             start = np.array([0.0 if effect.name == HYSTERESIS else -Design.of(effect, theta).lag_s])
             late = (*base.chosen[:k], *base.chosen[k + 1 :], *((of, start) for of in both))
             settings = base.logs[0].pair.settings.search
-            trial = fit(base.logs, late, near=base, give_up_above=base.objective)
-            if bic(trial) >= bic(base) - settings.clearly_better:
+            plainer = effect.name == HYSTERESIS or (_is_simulated(base.logs) and effect.name == LOW_PASSES[0])
+            slack = settings.clearly_better * (-1.0 if plainer else 1.0)
+            if complete and effect.name != HYSTERESIS:
+                slack = max(slack * base.reduced_chi_square, slow_squares(base, "accel"))
+            trial = fit(base.logs, late, near=base, give_up_above=base.objective + max(0.0, slack))
+            if bic(trial) >= bic(base) + slack:
                 return base
             maximum = settings.hysteresis_leaves * (fit(base.logs, late[:-2], near=base).objective - trial.objective)
             return base if effect.name == HYSTERESIS and leaves_slow_motion(trial, "accel", maximum) else trial
@@ -138,7 +145,9 @@ def with_filter_of_each_sensor(base: Fit, named: Sequence[Effect]) -> Fit:
     ):
         return base
     others, period_s = tuple(entry for k, entry in enumerate(base.chosen) if k not in lags), logs[0].pair.period_s
-    lag_s: dict[tuple[str, ...], float] = {(sensor,): sum(_lag_s(*base.chosen[k], sensor) for k in lags) for sensor in SENSORS}
+    lag_s: dict[tuple[str, ...], float] = {
+        (sensor,): sum(sensor_lag_s(*base.chosen[k], sensor) for k in lags) for sensor in SENSORS
+    }
     clocks, early_s = [of for of in named if of.name == "clock_offset"], min(0.0, *lag_s.values())
     early_s = early_s if early_s < -MIN_LAG * period_s else 0.0  # no filter is ahead, but a clock may be
     late = [sensors for sensors, own_s in lag_s.items() if own_s - early_s > MIN_LAG * period_s]
@@ -161,7 +170,7 @@ def with_filter_of_each_sensor(base: Fit, named: Sequence[Effect]) -> Fit:
     best = min((best, *offsets), key=_form_bic)
     if len(best.prior) < len(base.prior):  # simpler
         return best if _form_bic(best) < _form_bic(base) else base
-    margin = logs[0].pair.settings.search.clearly_better if len(best.prior) > len(base.prior) else 0.0
+    margin = logs[0].pair.settings.search.clearly_better
     errs = _model_error(logs) * sum(_taken(base, k) for k in lags if base.chosen[k][0].name in LOW_PASSES)
     return best if _form_bic(best) < _form_bic(base) - max(margin, errs) else base
 
@@ -204,17 +213,17 @@ def _form_bic(found: Fit) -> float:
 def is_late(found: Fit, low_pass: Effect) -> bool:
     """Whether a sensor is late behind its low-pass, whose lag no clock takes back."""
     own_s = next(Design.of(low_pass, theta).lag_s for effect, theta in found.chosen if effect is low_pass)
-    lags_s = (sum(_lag_s(*entry, sensor) for entry in found.chosen) for sensor in low_pass.sensors)
+    lags_s = (sum(sensor_lag_s(*entry, sensor) for entry in found.chosen) for sensor in low_pass.sensors)
     return not any(log.pair.aligned_s for log in found.logs) and min(lags_s, default=0.0) > TAKEN_BACK * own_s
 
 
-def _lag_s(effect: Effect, theta: Theta, sensor: str) -> float:
-    """Lag of one sensor far below any cut-off."""
+def sensor_lag_s(effect: Effect, theta: Theta, sensor: str) -> float:
+    """Lag of one sensor far below any cut-off; of a clock that wanders, its mean."""
     if effect.name in LOW_PASSES:
         return Design.of(effect, theta).lag_s if sensor in effect.sensors else 0.0
     if effect.key == "gyro_delay":
         return float(theta[0]) if sensor == "gyro" else 0.0
-    return -float(theta[0]) if effect.name == "clock_offset" else 0.0
+    return -float(np.mean(theta)) if effect.name in ("clock_offset", WANDER) else 0.0
 
 
 def _sensors(chosen: Chosen) -> list[tuple[str, ...]]:

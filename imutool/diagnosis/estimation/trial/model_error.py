@@ -19,6 +19,7 @@ from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.effects.gyro_bias_step import followed, orthonormal
+from imutool.sensor.effects.low_pass import Design
 
 CLOCKS = (*STEADY, WANDER)
 FILTERS = (*LOW_PASSES, "mount_resonance", "gyro_delay", "gyro_hysteresis", "accel_hysteresis")
@@ -30,6 +31,7 @@ OF_MOTION = FOLLOWING | {
 }
 BIAS_STEPS, AROUND_S = ("gyro_bias_step", "accel_bias_step"), 3.0  # on both sides, where a gain hardly changes
 
+TAKEN_BACK = 0.5  # of a low-pass's lag, by a gyro that is ahead
 SLOW = 0.25  # of a cut-off frequency: below, a low-pass takes 0.2 % (second order) to 3 % (first)
 SEEN_ERROR = 2.0  # times what other effects show of a low-pass's error (made-up flights whose vibrations fold: 1.4 to 3.6)
 
@@ -69,6 +71,13 @@ def below_model_error(
         for key, gain in gains.items()
         if name(key) in FOLLOWING and any(gain < share(key, other) * more for other, more in gains.items() if other != key)
     )
+
+
+def is_taken_back(found: Fit, low_pass: Effect) -> bool:
+    """Whether a gyro that is ahead takes most of its low-pass's lag back, as no filter does."""
+    ahead_s = -sum(float(theta[0]) for effect, theta in found.chosen if effect.key == "gyro_delay")
+    own_s = next(Design.of(low_pass, theta).lag_s for effect, theta in found.chosen if effect is low_pass)
+    return "gyro" in low_pass.sensors and ahead_s > TAKEN_BACK * own_s
 
 
 def of_motion(effect: Effect) -> bool:

@@ -31,6 +31,7 @@ from imutool.diagnosis.estimation.trial.model_error import (
     is_over_at_once,
     is_part_of_misfit,
     is_swing_of_motion,
+    is_taken_back,
     of_motion,
     with_low_pass_error,
 )
@@ -217,7 +218,7 @@ class Trial:
             or is_over_at_once(effect, theta, self.settings.implausible_factor)
             or is_swing_of_motion(effect, whole)
             or (
-                effect.name in HYSTERESES
+                (effect.name in HYSTERESES or (effect.lagless is not None and is_taken_back(whole, effect)))
                 and leaves_slow_motion(whole, effect.sensors[0], self.settings.hysteresis_leaves * gain[0])
             )
         )
