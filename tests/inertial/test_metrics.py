@@ -242,11 +242,12 @@ def test_a_path_whose_last_block_turns_at_the_origin_has_positions() -> None:
     assert errors.figures(lambda: iter(()))["ape_m"] == 0.0
 
 
-def test_a_body_without_positions_that_has_stopped_turning_has_none() -> None:
-    errors, turned = AbsoluteErrors(), wander(200, seed=11)
-    for rows in (slice(None), slice(-1, None)):
-        q_wb = turned.q_wb_wxyz[rows]
-        bare = Poses(turned.t_ns[rows] + len(q_wb), np.zeros((len(q_wb), 3)), q_wb, np.zeros((len(q_wb), 3)))
+@pytest.mark.parametrize("angle", [0.4, -0.4])
+def test_a_body_without_positions_that_has_stopped_turning_has_none(angle: float) -> None:
+    errors, turns = AbsoluteErrors(), quaternions(Rotation.from_rotvec(np.outer(np.linspace(0.0, 1.0, 50), [0.0, 0.0, angle])))
+    for start_ns, q_wb in ((0, turns), (10**9, turns[-1:])):
+        nothing = np.zeros((len(q_wb), 3))
+        bare = Poses(start_ns + 10**7 * np.arange(len(q_wb)), nothing, q_wb, nothing)
         errors.add(bare, bare)
     figures = errors.figures(lambda: iter(()))
     assert (figures["ape_m"], figures["velocity_rmse_m_s"]) == (None, None)

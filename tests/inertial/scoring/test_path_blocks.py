@@ -73,6 +73,8 @@ def test_windows_drift_in_pieces_as_on_the_whole_path(made: Recording) -> None:
         (window_drift(piece.path, piece.truth, *piece.windows.T), piece) for piece in pieces(samples, span, windows, margin=1)
     ]
     assert len(found) > 1
+    assert {int(piece.windows[0, 0]) for _, piece in found[1:]} == {1}
+    assert {len(piece.path) - 1 - int(piece.windows[-1, 1]) for _, piece in found[:-1]} == {1}
     assert max(len(piece.path) for _, piece in found) <= AT_ONCE + 3
     for column in range(3):
         joined = np.concatenate([drift[column] for drift, _ in found])
