@@ -312,6 +312,49 @@ def test_a_damaged_attachment_is_left_out(foreign: Foreign, flight: Messages, tm
     assert len(by_mcap(target)) == len(flight)
 
 
+def first_record(path: Path, opcode: Opcode) -> int:
+    """Where the first record of a kind begins in a whole log."""
+    raw, at = path.read_bytes(), len(MAGIC)
+    while raw[at] != opcode:
+        at += HEAD.size + HEAD.unpack_from(raw, at)[1]
+    return at
+
+
+@pytest.mark.parametrize("layout", UNCHUNKED, indirect=True)
+def test_an_attachment_that_lacks_bytes_hides_no_messages_behind_it(foreign: Foreign, layout: str) -> None:
+    path = foreign(some(2, 60), layout, attachments=(b"abc" * 300,))
+    whole, at = content_of(path), first_record(path, Opcode.ATTACHMENT)
+    raw = path.read_bytes()
+    path.write_bytes(raw[: at + 200] + raw[at + 600 :])
+    assert content_of(path) == whole
+
+
+@pytest.mark.parametrize(
+    ("layout", "cut", "inside"),
+    [
+        ("unchunked-no-summary", Opcode.ATTACHMENT, 200),
+        ("no-index", Opcode.ATTACHMENT, 200),
+        ("no-summary-but-message-index", Opcode.MESSAGE_INDEX, 40),
+    ],
+    indirect=["layout"],
+)
+def test_a_record_that_is_cut_off_hides_no_log_that_follows(foreign: Foreign, layout: str, cut: Opcode, inside: int) -> None:
+    """Its messages were on the topics of the log before it: the ids are the same."""
+    path = foreign(some(2, 60), layout, chunk_size=2000, attachments=(b"abc" * 300,))
+    other = foreign(some(4, 60, ("/c", "/d"), 10**18 + 10**9), layout, chunk_size=2000, name="b")
+    following, before, at = content_of(other), content_of(path), first_record(path, cut)
+    path.write_bytes(path.read_bytes()[: at + inside] + other.read_bytes())
+    found = content_of(path)
+    assert [m for m in found if m[0] in ("/c", "/d")] == following
+    assert set(found) <= {*before, *following}
+
+
+def content_of(path: Path) -> list[Message]:
+    with RecoveredLog(path) as log:
+        log.check()
+        return content(log)
+
+
 @pytest.mark.parametrize("layout", ["no-index"], indirect=True)
 def test_chunks_are_in_order_though_only_an_attachment_is_damaged(foreign: Foreign, tmp_path: Path, layout: str) -> None:
     """It was found while the chunks were copied, after they would have been put in order."""
