@@ -197,7 +197,7 @@ def test_a_zeroed_chunk_head_costs_that_chunk_alone_and_surviving_indexes_count_
 
 
 @pytest.mark.parametrize("layout", ["zstd", "lz4", "plain", "no-summary"], indirect=True)
-@pytest.mark.parametrize("field", ["opcode", "length", "inner length"])
+@pytest.mark.parametrize("field", ["opcode", "length", "start", "inner length"])
 def test_a_damaged_chunk_head_is_put_right_where_its_contents_are_sound(
     foreign: Foreign, flight: Messages, tmp_path: Path, layout: str, field: str
 ) -> None:
@@ -207,6 +207,7 @@ def test_a_damaged_chunk_head_is_put_right_where_its_contents_are_sound(
     at, value = {
         "opcode": (block.offset, b"\x46"),
         "length": (block.offset + 1, (2**62).to_bytes(8, "little")),
+        "start": (block.offset + 9, (block.start_ns - 10**9).to_bytes(8, "little")),
         "inner length": (block.offset + 9 + 32 + name, (77).to_bytes(8, "little")),
     }[field]
     put(path, at, value)
