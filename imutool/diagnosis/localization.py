@@ -162,8 +162,8 @@ def locate(
                 tuple(AXES[a] for a in axes) if len(axes_power) == len(AXES) else (),
                 tuple(_acting(intervals(begins, settings), t_s, scaled[:, columns])),
                 text,
-                float(power[inside].sum() / max(power.sum(), 1e-300)),
-                p_values.get(signal, float(chi2.sf(axes_power.sum(), len(axes_power)))),
+                float(power[inside].sum() / power.sum()),
+                p_values.get(signal, 1.0),
                 extent=extent,
             )
         )
@@ -248,9 +248,9 @@ def regime(
 ) -> tuple[Extent, str]:
     """Extent of a misfit, and its regime in words: "angular rate above 0.4 rad/s", "after 30 s"."""
     high = inside if not inside.all() else power > np.median(power)
-    if high.all() or not high.any():
+    if not high.any():  # one window alone
         return "everywhere", "always"
-    counts = np.maximum(np.bincount(window), 1)
+    counts = np.bincount(window)
     best: tuple[float, str] | None = None
     for name, (unit, values) in variables.items():
         level = np.bincount(window, weights=values) / counts
@@ -277,7 +277,7 @@ def _youden(level: Float64[np.ndarray, " w"], high: Sequence[bool] | Bool[np.nda
     """Youden's index of the best threshold between high windows and others, and the threshold."""
     order = np.argsort(level)
     flags = np.asarray(high)[order]
-    above_high = 1.0 - np.cumsum(flags) / max(flags.sum(), 1)
-    above_low = 1.0 - np.cumsum(~flags) / max((~flags).sum(), 1)
+    above_high = 1.0 - np.cumsum(flags) / flags.sum()
+    above_low = 1.0 - np.cumsum(~flags) / (~flags).sum()
     k = int(np.argmax(above_high - above_low))
     return float(above_high[k] - above_low[k]), float(0.5 * (level[order][k] + level[order][min(k + 1, len(level) - 1)]))

@@ -214,7 +214,7 @@ class RelativeErrors:
             apart_m = quaternion.length(quaternion.rotate(self._C[i], moved) - moved_true).sum() if len(i) else 0.0
             turned = quaternion.angle_between(self._C[i], self._C[j]).sum() if len(i) else 0.0
             self._sums[k] += len(i), apart_m, turned
-        self._next[k] = max(end, self._next[k])
+        self._next[k] = end
 
     @np.errstate(over="ignore", invalid="ignore")
     def figures(self) -> dict[str, dict[str, float | None]]:

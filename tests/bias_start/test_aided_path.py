@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -97,10 +99,10 @@ def test_it_begins_where_it_is_told_to(far_m: float) -> None:
 
 
 def test_wheels_on_the_ground_hold_the_position(drive: Drive) -> None:
-    """The lever arm of 0.3 m and a mount that is off by 1.5 degrees are estimated with it."""
+    """The lever arm of 0.3 m, a mount that is off by 1.5 degrees and a radius by 5 % are estimated with it."""
     start = StartPose.of(drive.truth)
     pure = dead_reckon(drive.imu, start)
-    aided = aided_path(drive.imu, start, DRIVEN, Aids(WHEELS, odometry=wheels(drive, 0.003)))
+    aided = aided_path(drive.imu, start, DRIVEN, Aids(WHEELS, odometry=wheels(drive, 0.05)))
     assert rms(error_m(pure, drive.truth)) > 50.0
     assert rms(error_m(aided, drive.truth)) < 0.5
     assert aided.v_w is not None
@@ -116,6 +118,15 @@ def test_a_wheel_that_slips_is_not_believed(drive: Drive) -> None:
     start = StartPose.of(drive.truth)
     aided = aided_path(drive.imu, start, DRIVEN, Aids(WHEELS, odometry=odometry))
     assert rms(error_m(aided, drive.truth)) < 1.5  # six seconds at 3 m/s are 18 m
+
+
+def test_wheels_say_nothing_while_they_are_silent(drive: Drive) -> None:
+    """Their last speed held over 15 s."""
+    whole = wheels(drive)
+    t_s = (whole.poses.t_ns - whole.poses.t_ns[0]) * 1e-9
+    odometry = replace(whole, poses=whole.poses.rows((t_s < 25.0) | (t_s > 40.0)))
+    aided = aided_path(drive.imu, StartPose.of(drive.truth), DRIVEN, Aids(WHEELS, odometry=odometry))
+    assert rms(error_m(aided, drive.truth)) < 0.3
 
 
 def test_contact_with_the_ground_alone(drive: Drive) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -133,6 +135,15 @@ def test_a_body_at_rest_is_expected_to_drift_as_a_constant_bias_makes_it(lost: s
     for variances in found:
         np.testing.assert_allclose(variances[:3], (STD[:3] * length_s) ** 2, rtol=0.02)
         np.testing.assert_allclose(variances[3:], (STD[3:] * length_s) ** 2 + tilted, rtol=0.03)
+
+
+def test_a_window_of_which_nothing_was_measured_expects_nothing() -> None:
+    imu = Imu(np.arange(2001) * 5_000_000, np.zeros((2001, 3)), np.tile([0.0, 0.0, 9.81], (2001, 1)))
+    imu = replace(imu, accel=np.where(np.arange(2001)[:, None] < 1100, 0.0, imu.accel))
+    still = Poses(imu.t_ns, np.zeros((2001, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (2001, 1)), np.zeros((2001, 3)))
+    lost, half = ExpectedDrift(static.Model(), WAYS["held"], imu)(still, np.array([[0, 1000], [1000, 2000]]))
+    assert not lost.any()
+    assert half.any()
 
 
 def test_what_a_window_expects_does_not_depend_on_how_the_samples_before_it_came(

@@ -167,6 +167,17 @@ def test_a_car_that_drives_steadily_does_not_stop(push_m_s2: float, rate_rad_s: 
     assert np.abs(blocks[-1].step.after.bias[:3]).max() < 2e-3
 
 
+@pytest.mark.parametrize(("known", "rate", "rests"), [(0.0, 0.08, False), (0.08, 0.08, True), (0.08, 0.0, True)])
+def test_a_steady_rate_that_no_bias_explains_is_a_turn_and_no_stop(known: float, rate: float, rests: bool) -> None:
+    """A bias may be as this sensor has it, or as a sensor usually has it: a file may state another unit's."""
+    t_s, rng = np.arange(0.0, 4.0, 0.005), np.random.default_rng(0)
+    gyro = 1e-3 * rng.normal(size=(800, 3)) + [0.0, 0.0, rate]
+    accel = [0.0, 0.0, 9.81] + 0.02 * rng.normal(size=(800, 3))
+    filter_ = BiasFilter(replace(KNOWN, mean=np.array([0.0, 0.0, known, 0.0, 0.0, 0.0])), ahead=True)
+    blocks = [*filter_.feed(t_s, gyro, accel), *filter_.finish()]
+    assert {block.resting for block in blocks} == {rests}
+
+
 def test_a_body_of_unknown_speed_may_be_a_car() -> None:
     """Its long acceleration looked like a tilt, hence a bias of 0.8 mrad/s; `static --smooth` had three times its error."""
     t_s, rng = np.arange(0.0, 100.0, 0.02), np.random.default_rng(0)

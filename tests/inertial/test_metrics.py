@@ -221,8 +221,17 @@ def test_what_the_data_do_not_determine_is_none() -> None:
     assert figures["aoe_aligned_deg"] is None
     assert figures["ape_aligned_m"] is None
     assert figures["aoe_deg"] == pytest.approx(0.0, abs=1e-6)
-    line = Poses(truth.t_ns, np.arange(200)[:, None] * [0.1, 0.0, 0.0], truth.q_wb_wxyz)
-    assert absolute(line, line, mask)["ape_aligned_m"] is None
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_straight_path_says_nothing_of_a_turn_about_itself(seed: int) -> None:
+    """Off its line by rounding alone, it was turned by up to 176 degrees against itself."""
+    rng = np.random.default_rng(seed)
+    p_wb = np.linspace(0.0, 1.0, 500)[:, None] * rng.normal(size=3) * 10.0 ** rng.uniform(-3.0, 3.0) + rng.normal(size=3)
+    for written in (p_wb, p_wb.round(9)):
+        line = Poses(START_NS + 10**7 * np.arange(500), written, np.tile([1.0, 0.0, 0.0, 0.0], (500, 1)))
+        figures = absolute(line, line, everything(line))
+        assert (figures["aoe_aligned_deg"], figures["ape_aligned_m"]) == (None, None)
 
 
 def test_a_path_whose_last_block_turns_at_the_origin_has_positions() -> None:
@@ -231,6 +240,17 @@ def test_a_path_whose_last_block_turns_at_the_origin_has_positions() -> None:
     at_origin = Poses(path.t_ns + 10**10, np.zeros_like(path.p_wb), path.q_wb_wxyz, np.zeros_like(path.p_wb))
     errors.add(at_origin, at_origin)
     assert errors.figures(lambda: iter(()))["ape_m"] == 0.0
+
+
+@pytest.mark.parametrize("angle", [0.4, -0.4])
+def test_a_body_without_positions_that_has_stopped_turning_has_none(angle: float) -> None:
+    errors, turns = AbsoluteErrors(), quaternions(Rotation.from_rotvec(np.outer(np.linspace(0.0, 1.0, 50), [0.0, 0.0, angle])))
+    for start_ns, q_wb in ((0, turns), (10**9, turns[-1:])):
+        nothing = np.zeros((len(q_wb), 3))
+        bare = Poses(start_ns + 10**7 * np.arange(len(q_wb)), nothing, q_wb, nothing)
+        errors.add(bare, bare)
+    figures = errors.figures(lambda: iter(()))
+    assert (figures["ape_m"], figures["velocity_rmse_m_s"]) == (None, None)
 
 
 def test_one_pose_has_absolute_figures_only() -> None:
@@ -242,10 +262,11 @@ def test_one_pose_has_absolute_figures_only() -> None:
 
 def test_diverged_numbers_are_refused() -> None:
     truth = wander(300, seed=13)
-    away = Poses(truth.t_ns, truth.p_wb * 1e200, truth.q_wb_wxyz, truth.v_w)
-    for function in (absolute, evaluate):
-        with pytest.raises(NumericsError):
-            function(away, truth, everything(truth))
+    for factor in (1e200, 1e307):  # as do their squares, and their products with the truth
+        away = Poses(truth.t_ns, truth.p_wb * factor, truth.q_wb_wxyz, truth.v_w)
+        for function in (absolute, evaluate):
+            with pytest.raises(NumericsError):
+                function(away, truth, everything(truth))
 
 
 def test_trajectories_that_do_not_match_are_refused() -> None:

@@ -9,6 +9,7 @@ from imutool.errors import NumericsError
 
 # least singular value (m²): below it positions lie on a line for evo, and rotation about the line is free
 FLAT = np.finfo(np.float64).eps
+ROUNDED = 1e-12  # of the largest singular value: a straight path is off its line by rounding, to a millionth of its length
 
 Points = Float64[np.ndarray, "n 3"]
 Motion = tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]
@@ -59,7 +60,7 @@ class Moments:
         if not np.isfinite(covariance).all():
             raise NumericsError("positions overflow when aligned", expected="positions within range", fix="Shorten the log")
         u, size, vt = np.linalg.svd(covariance)
-        if np.count_nonzero(size > FLAT) < 2:
+        if np.count_nonzero(size > max(FLAT, ROUNDED * size[0])) < 2:
             return None
         mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # a rotation, not a reflection
         R = u @ mirror @ vt

@@ -17,7 +17,7 @@ from mcap.records import ChunkIndex, Header
 from imutool.errors import LogError
 from imutool.mcap_io.blocks import HEAD_BYTES, RUN_BYTES, Attachment, MessageBlock, RecordSpan, too_large
 from imutool.mcap_io.codec import messages, records
-from imutool.mcap_io.codec.records import HEAD, MAGIC
+from imutool.mcap_io.codec.records import DATA_END_SIZE, HEAD, MAGIC
 from imutool.mcap_io.recovery.chunk_repair import UnreadableError, prove
 from imutool.mcap_io.recovery.losses import LATEST_NS, Losses, reason
 from imutool.mcap_io.recovery.resync import LOG_START, MAX_CANDIDATES, RecordFrames
@@ -54,9 +54,7 @@ class Scan(ScanResult):
         position = self._start()
         while position < self.limit:
             if len(self.items) + len(self.gaps) > MAX_ITEMS:
-                raise LogError(
-                    f"the log has more than {MAX_ITEMS} chunks and other records", expected="one that a recorder made"
-                )
+                raise LogError(f"the log has more than {MAX_ITEMS} records", expected="one that a recorder made")
             after = self._step(position)
             position = self._gap(position) if after is None else after
         self._close()
@@ -66,6 +64,8 @@ class Scan(ScanResult):
         limit = self.limit
         if self.has_summary and not self._ended:
             self.losses.add_harmless(f"the DataEnd record before byte {limit} is damaged; a new one can be made")
+            if self.gaps and (self.gaps[-1].offset, self.gaps[-1].end) == (limit - DATA_END_SIZE, limit):
+                self.events.remove(self.gaps.pop())  # no message was in it
         elif self._ended and not self._closed and not self.has_summary:
             self.losses.add_harmless("the log ends inside its summary; a new one can be made")
         elif not self._ended and not (self.gaps and self.gaps[-1].end == limit):

@@ -9,6 +9,7 @@ from support import planted
 from support.seeds import seeds
 
 from imutool.diagnosis.diagnose import candidates_for
+from imutool.diagnosis.estimation import unnamed_effects
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
@@ -23,6 +24,7 @@ from imutool.diagnosis.estimation.trial.model_error import (
     is_over_at_once,
     is_part_of_misfit,
     is_swing_of_motion,
+    of_motion,
     with_low_pass_error,
 )
 from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection
@@ -120,6 +122,13 @@ def test_a_drift_that_was_over_before_the_first_sample_has_no_size(name: str, th
     if effect.reached is not None:
         effect = next(gyro_bias_drift.within([effect], planted.DURATION_S))
     assert is_over_at_once(effect, np.array(theta), SETTINGS.implausible_factor) == over
+
+
+def test_what_has_no_name_follows_the_motion_unless_it_is_a_curve_over_time() -> None:
+    like = unnamed_effects.like([planted.pair(planted.rich())])
+    unnamed = [*unnamed_effects.curves(like), *unnamed_effects.terms(like)]
+    assert {of_motion(effect) for effect in unnamed if effect.of_time} == {False}
+    assert {of_motion(effect) for effect in unnamed if not effect.of_time} == {True}
 
 
 def test_what_does_not_follow_the_motion_is_told_however_faint() -> None:

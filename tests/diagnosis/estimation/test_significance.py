@@ -111,6 +111,24 @@ def test_a_jump_is_judged_over_a_clock_that_is_fitted_without_it(
     assert effects or first_refuted(found, 0) == 2, "with each held at its value both seem needed"
 
 
+def test_a_small_effect_stands_next_to_a_step_that_no_unseen_block_shows() -> None:
+    """All unseen blocks lie before 40 s, so that a fit of them knows nothing of the step, which the fitted ones need."""
+    truth = {"gyro_bias_step": [0.2, -0.2, 0.1, 40.0], "gyro_scale": [1e-3, -1e-3, 1e-3]}
+    log = planted.weighed(planted.pair(FELT, truth))
+    assert first_refuted(fit([log], planted.acting(truth)), 0) == 2
+
+
+def test_a_step_that_no_unseen_block_shows_is_not_judged_by_its_own_fit() -> None:
+    """A step in noise: where the blocks of its own fit counted as well, three of five were needed."""
+    needed = 0
+    for seed in range(8):
+        log = planted.weighed(planted.pair(FELT, seed=seed))
+        for begins_s in (4.0, 38.0, 41.0):
+            found = fit([log], planted.acting({"gyro_bias_step": [0.0, 0.0, 0.0, begins_s]}))
+            needed += first_refuted(found, 0) == 1
+    assert needed <= 6  # of 24, where a twentieth is expected
+
+
 def test_a_gain_is_as_likely_as_it_comes_where_noise_lasts() -> None:
     """An effect that is not there: chances below a twentieth come about that often, by chi-square far more."""
     often = {"blocks": 0, "squares": 0}

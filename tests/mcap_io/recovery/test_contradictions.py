@@ -101,6 +101,20 @@ def test_a_chunk_that_is_gone_is_lost_though_its_message_indexes_remain(log: Pat
     assert report.losses.topics == Counter(m[0] for m in gone)
 
 
+@pytest.mark.parametrize(("at", "value"), [(0, b"\0"), (0, b"\x90"), (1, b"\xff")], ids=["opcode", "private opcode", "length"])
+def test_a_damaged_end_of_the_data_costs_nothing(log: Path, at: int, value: bytes) -> None:
+    """Its 13 bytes were lost with an unknown number of messages, and mended at the same time."""
+    whole, raw = by_mcap(log), log.read_bytes()
+    with Log(log) as before:
+        end = before.index.data_end
+    log.write_bytes(raw[: end + at] + value + raw[end + at + 1 :])
+    found, report = saved(log)
+    assert found == Counter(whole)
+    assert not report.losses
+    (line,) = report.losses.harmless
+    assert line.startswith("the DataEnd record before byte")
+
+
 def test_a_chunk_that_is_there_twice_is_kept_once(log: Path) -> None:
     whole, raw = stretches(log), log.read_bytes()
     start, end, _ = whole[3]

@@ -197,7 +197,7 @@ def test_a_zeroed_chunk_head_costs_that_chunk_alone_and_surviving_indexes_count_
 
 
 @pytest.mark.parametrize("layout", ["zstd", "lz4", "plain", "no-summary"], indirect=True)
-@pytest.mark.parametrize("field", ["opcode", "length", "inner length"])
+@pytest.mark.parametrize("field", ["opcode", "length", "start", "inner length"])
 def test_a_damaged_chunk_head_is_put_right_where_its_contents_are_sound(
     foreign: Foreign, flight: Messages, tmp_path: Path, layout: str, field: str
 ) -> None:
@@ -207,6 +207,7 @@ def test_a_damaged_chunk_head_is_put_right_where_its_contents_are_sound(
     at, value = {
         "opcode": (block.offset, b"\x46"),
         "length": (block.offset + 1, (2**62).to_bytes(8, "little")),
+        "start": (block.offset + 9, (block.start_ns - 10**9).to_bytes(8, "little")),
         "inner length": (block.offset + 9 + 32 + name, (77).to_bytes(8, "little")),
     }[field]
     put(path, at, value)
@@ -310,6 +311,49 @@ def test_a_damaged_attachment_is_left_out(foreign: Foreign, flight: Messages, tm
     with target.open("rb") as file:
         assert [a.data for a in make_reader(file).iter_attachments()] == [b"a" * 3000]
     assert len(by_mcap(target)) == len(flight)
+
+
+def first_record(path: Path, opcode: Opcode) -> int:
+    """Where the first record of a kind begins in a whole log."""
+    raw, at = path.read_bytes(), len(MAGIC)
+    while raw[at] != opcode:
+        at += HEAD.size + HEAD.unpack_from(raw, at)[1]
+    return at
+
+
+@pytest.mark.parametrize("layout", UNCHUNKED, indirect=True)
+def test_an_attachment_that_lacks_bytes_hides_no_messages_behind_it(foreign: Foreign, layout: str) -> None:
+    path = foreign(some(2, 60), layout, attachments=(b"abc" * 300,))
+    whole, at = content_of(path), first_record(path, Opcode.ATTACHMENT)
+    raw = path.read_bytes()
+    path.write_bytes(raw[: at + 200] + raw[at + 600 :])
+    assert content_of(path) == whole
+
+
+@pytest.mark.parametrize(
+    ("layout", "cut", "inside"),
+    [
+        ("unchunked-no-summary", Opcode.ATTACHMENT, 200),
+        ("no-index", Opcode.ATTACHMENT, 200),
+        ("no-summary-but-message-index", Opcode.MESSAGE_INDEX, 40),
+    ],
+    indirect=["layout"],
+)
+def test_a_record_that_is_cut_off_hides_no_log_that_follows(foreign: Foreign, layout: str, cut: Opcode, inside: int) -> None:
+    """Its messages were on the topics of the log before it: the ids are the same."""
+    path = foreign(some(2, 60), layout, chunk_size=2000, attachments=(b"abc" * 300,))
+    other = foreign(some(4, 60, ("/c", "/d"), 10**18 + 10**9), layout, chunk_size=2000, name="b")
+    following, before, at = content_of(other), content_of(path), first_record(path, cut)
+    path.write_bytes(path.read_bytes()[: at + inside] + other.read_bytes())
+    found = content_of(path)
+    assert [m for m in found if m[0] in ("/c", "/d")] == following
+    assert set(found) <= {*before, *following}
+
+
+def content_of(path: Path) -> list[Message]:
+    with RecoveredLog(path) as log:
+        log.check()
+        return content(log)
 
 
 @pytest.mark.parametrize("layout", ["no-index"], indirect=True)

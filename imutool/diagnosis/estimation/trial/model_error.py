@@ -88,9 +88,10 @@ def of_motion(effect: Effect) -> bool:
 def below_reference_error(effect: Effect, gain: float, found: Fit) -> bool:
     """Whether an effect that follows the motion is below the error of a simulation itself.
 
-    It interpolates, integrates and rounds, so its motion errs by a share, however little noise a recording has.
+    It interpolates, integrates and rounds, so its motion errs by a share, however little noise a recording has. Poses have far
+    more noise than this share.
     """
-    if not _follows_body(effect, found) or not all(log.pair.exact for log in found.logs):
+    if not _follows_body(effect, found):
         return False
     motion = 0.0
     for log in found.logs:
