@@ -17,7 +17,7 @@ from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars, unit_quaternions
 
-from . import Sequence, _table
+from . import Sequence, _asl_table
 from ._source import Tree
 
 IMU = "imu0"
@@ -37,7 +37,7 @@ IMAGE_FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 
 def float_stamps(tree: Tree) -> bool:
     """Whether the IMU's stamps are in scientific notation; only FETCH writes them so."""
-    return b"e" in _table.first_row(tree.head(f"{IMU}/data.csv")).partition(b",")[0].lower()
+    return b"e" in _asl_table.first_row(tree.head(f"{IMU}/data.csv")).partition(b",")[0].lower()
 
 
 def identity(format: str, sequence: Sequence, sensor: str, known: bool) -> dict[str, str]:
@@ -72,11 +72,11 @@ def recording(sequence: Sequence, *, dataset: str, sensor: str, known: bool, tru
     }
     metadata.update({name: {"text": content[name].decode("utf-8", "backslashreplace")} for name in texts})
     notes: dict[str, dict[str, str]] = {"imutool/repairs": {}, "imutool/skipped": {}, "imutool/losses": {}}
-    samples = imu(_table.parse(content.pop(tables[IMU]), tree.where(tables[IMU]), "imu"))
+    samples = imu(_asl_table.parse(content.pop(tables[IMU]), tree.where(tables[IMU]), "imu"))
     poses: dict[str, Poses] = {}
     scalars: dict[str, Scalars] = {}
     for folder in folders:
-        table = _table.parse(content.pop(tables[folder]), tree.where(tables[folder]), "truth")
+        table = _asl_table.parse(content.pop(tables[folder]), tree.where(tables[folder]), "truth")
         repeated = add_truth(table, truths[folder], poses, scalars)
         if repeated:
             notes["imutool/repairs"][truths[folder]] = REPEATED.format(repeated)
@@ -108,7 +108,7 @@ def _mount(settings: bytes) -> Float64[np.ndarray, "16"]:
     return numbers if len(numbers) == 16 else np.eye(4).reshape(-1)
 
 
-def imu(table: _table.Table) -> Imu:
+def imu(table: _asl_table.Table) -> Imu:
     """IMU samples.
 
     Raises:
@@ -119,7 +119,7 @@ def imu(table: _table.Table) -> Imu:
     return Imu(table.t_ns, table.columns["gyro"], table.columns["accel"])
 
 
-def add_truth(table: _table.Table, topic: str, poses: dict[str, Poses], scalars: dict[str, Scalars]) -> int:
+def add_truth(table: _asl_table.Table, topic: str, poses: dict[str, Poses], scalars: dict[str, Scalars]) -> int:
     """Add poses and bias channels under their topics; count dropped repeated stamps.
 
     Raises:
@@ -135,7 +135,7 @@ def add_truth(table: _table.Table, topic: str, poses: dict[str, Poses], scalars:
         row = int(np.argmax(bad))
         raise table.fault(row, f"quaternion {q_wb_wxyz[row].tolist()} has norm {norm[row]:.6g}", "norm 1")
     new = np.concatenate([[True], np.diff(table.t_ns) != 0])
-    kept = _table.Table(table.where, table.t_ns[new], {k: v[new] for k, v in table.columns.items()}, table.lines[new])
+    kept = _asl_table.Table(table.where, table.t_ns[new], {k: v[new] for k, v in table.columns.items()}, table.lines[new])
     kept.check_clock()
     columns = kept.columns
     poses[topic] = Poses(kept.t_ns, columns["p_wb"], unit_quaternions(columns["q_wb_wxyz"]), columns["v_w"] if known else None)
@@ -154,7 +154,7 @@ def _frames(tree: Tree, camera: str, content: bytes) -> Frames | str:
     where = tree.where(f"{camera}/data.csv")
     stamps: dict[str, int] = {}
     missing: tuple[int, str] | None = None
-    for t_ns, file, line in _table.pairs(content, where):
+    for t_ns, file, line in _asl_table.pairs(content, where):
         name = f"{camera}/data/{file}"
         if name in stamps:
             raise DataError(f"{file} is listed twice", where=f"{where}:{line}")

@@ -21,9 +21,9 @@ from imutool.errors import ConfigError, DataError, LogError, required
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars
 
 from . import Sequence, _asl
+from ._asl_table import Table
 from ._ros_types import ros2_name
 from ._source import is_bag
-from ._table import Table
 
 IMU = "sensor_msgs/msg/Imu"
 POSES = ("geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry")

@@ -31,9 +31,9 @@ from ._archive import (
     stem,
 )
 from ._source import each_path, head, named_folder
-from ._table_files import kind_of
-from ._table_folder import ENDINGS as TABLES
-from ._table_packed import is_packed_alone, pieces, table_name
+from ._tables.files.formats import kind_of
+from ._tables.recordings.folder import ENDINGS as TABLES
+from ._tables.text.packed import is_packed_alone, pieces, table_name
 
 logger = logging.getLogger(__package__)
 TAR = ".tar"  # in .xz, .bz2 or .zst; a .tar.gz is an archive itself

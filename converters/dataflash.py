@@ -27,7 +27,7 @@ from . import Sequence
 from ._archive import refusing
 from ._dataflash_messages import FMT, FMT_SIZE, HEAD, TEXT_START, Messages, read_messages, text_of
 from ._source import find_files
-from ._table_geodetic import plane
+from ._tables.columns.geodetic import plane
 
 GENERAL = True
 TEMPERATURES = "T", "Temp"  # of the sensor, in degrees Celsius; of older logs the second

@@ -14,7 +14,7 @@ from imutool.recording.message_log import MessageLog, Remarks
 from . import Sequence
 from ._px4_topics import Columns, imus_of, poses_of, table_of
 from ._source import find_folders, head
-from ._table_numbers import plain_columns
+from ._tables.text.numbers import plain_columns
 
 GENERAL = True
 SENSORS = r"(?P<log>.*?)_?sensor_(combined|gyro(_fifo)?)_\d+\.csv"

@@ -27,10 +27,10 @@ from . import Sequence
 from ._archive import list_members, read_bounded, refusing
 from ._oxts import OXTS, read_oxts
 from ._source import each_path, find_folders, name, named_folder, with_suffix
-from ._table_names import split_name
-from ._table_text import Columns, read_csv
-from ._table_times import begun_at_zero
-from ._table_units import GRAVITY_BAND, GYRO_SI, STANDARD_GRAVITY, unit_doubts
+from ._tables.columns.times import begun_at_zero
+from ._tables.columns.units import GRAVITY_BAND, GYRO_SI, STANDARD_GRAVITY, unit_doubts
+from ._tables.text.delimited import Columns, read_csv
+from ._tables.text.names import split_name
 
 GENERAL = True
 IMU_TOPIC = "/imu0"

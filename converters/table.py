@@ -23,13 +23,9 @@ from imutool.recording.sample_order import in_order, lost_to_set_back
 
 from . import Sequence, _unpacking
 from ._source import head, name
-from ._table_dates import said_epoch
-from ._table_files import kind_of, load
-from ._table_folder import load_split, sequences_below
-from ._table_geodetic import to_east_north_up
-from ._table_groups import MAX_CONSTANTS, group_entries, imus_apart, pose_clock, shared_group, time_beside, turned
-from ._table_layouts import known_layout
-from ._table_map import (
+from ._tables.columns.geodetic import to_east_north_up
+from ._tables.columns.groups import MAX_CONSTANTS, group_entries, imus_apart, pose_clock, shared_group, time_beside, turned
+from ._tables.columns.map import (
     IMU_TOPIC,
     POSES_GROUP,
     TRUE_ENTRIES,
@@ -45,16 +41,20 @@ from ._table_map import (
     vectors_named,
     within_groups,
 )
-from ._table_motion import settle_accel_unit
-from ._table_names import topic_of
-from ._table_packed import table_name
-from ._table_parts import load_table, recordings_in, refuse_joined
-from ._table_pose_names import why_no_poses
-from ._table_propose import propose, without_copies
-from ._table_rotations import known_rotations, of_matrices, unit_by_poses
-from ._table_text import Columns, matrix_columns
-from ._table_times import COUNTED, begun_at_zero, count_times
-from ._table_units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
+from ._tables.columns.motion import settle_accel_unit
+from ._tables.columns.pose_names import why_no_poses
+from ._tables.columns.propose import propose, without_copies
+from ._tables.columns.rotations import known_rotations, of_matrices, unit_by_poses
+from ._tables.columns.times import COUNTED, begun_at_zero, count_times
+from ._tables.columns.units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
+from ._tables.files.formats import kind_of, load
+from ._tables.files.layouts import known_layout
+from ._tables.recordings.folder import load_split, sequences_below
+from ._tables.recordings.parts import load_table, recordings_in, refuse_joined
+from ._tables.text.dates import said_epoch
+from ._tables.text.delimited import Columns, matrix_columns
+from ._tables.text.names import topic_of
+from ._tables.text.packed import table_name
 
 unpacked = _unpacking.unpacked  # `convert` asks for it where no converter reads a source as it is
 GENERAL = True

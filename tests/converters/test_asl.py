@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imutool.converters import _table, euroc, fetch, tum_vi
+from imutool.converters import _asl_table, euroc, fetch, tum_vi
 from imutool.errors import DataError
 
 PARSE_LIMIT_S = 1.0  # 30 000 rows of 17 columns take about 0.1 s here; ten times that would be felt on every conversion
@@ -25,19 +25,19 @@ def spoil(files, name, line, text):
 @given(st.lists(st.integers(0, 2**63 - 1), min_size=1, max_size=20))
 def test_scientific_stamps_are_read_to_the_last_digit(stamps):
     rows = [f"{t // 10**18}.{t % 10**18:018d}e+18,1,2,3,4,5,6" for t in stamps]
-    parsed = _table.parse("\n".join(rows).encode(), "t.csv", "imu")
+    parsed = _asl_table.parse("\n".join(rows).encode(), "t.csv", "imu")
     assert parsed.t_ns.tolist() == stamps
 
 
 @given(st.lists(st.integers(0, 2**63 - 1), min_size=1, max_size=20))
 def test_integer_stamps_are_read_to_the_last_digit(stamps):
-    parsed = _table.parse("\n".join(f"{t}, 1,2,3,4,5,6" for t in stamps).encode(), "t.csv", "imu")
+    parsed = _asl_table.parse("\n".join(f"{t}, 1,2,3,4,5,6" for t in stamps).encode(), "t.csv", "imu")
     assert parsed.t_ns.tolist() == stamps
 
 
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=6, max_size=6))
 def test_numbers_are_read_as_the_nearest_float64(values):
-    parsed = _table.parse(f"17,{','.join(map(repr, values))}\n".encode(), "t.csv", "imu")
+    parsed = _asl_table.parse(f"17,{','.join(map(repr, values))}\n".encode(), "t.csv", "imu")
     assert parsed.columns["gyro"][0].tolist() == values[:3]
     assert parsed.columns["accel"][0].tolist() == values[3:]
 
@@ -46,7 +46,7 @@ def test_a_long_wide_table_parses_quickly():
     row = ",".join(["{}"] + ["-0.0123456789"] * 16)
     content = "\n".join(row.format(1403636579758560000 + n * 5_000_000) for n in range(30_000)).encode()
     start = time.process_time()
-    parsed = _table.parse(content, "t.csv", "truth")
+    parsed = _asl_table.parse(content, "t.csv", "truth")
     assert time.process_time() - start < PARSE_LIMIT_S
     assert len(parsed.t_ns) == 30_000
 

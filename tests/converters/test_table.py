@@ -14,8 +14,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
-from imutool.converters import _table_mat, table
-from imutool.converters._table_map import read_map
+from imutool.converters import table
+from imutool.converters._tables.columns.map import read_map
+from imutool.converters._tables.files import mat as table_mat
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -368,7 +369,7 @@ def test_a_parquet_file_of_a_few_bytes_is_refused_before_it_unpacks(tmp_path, mo
 
     alike = {name: np.full(1 << 20, 9.81) for name in ("t", "gx", "gy", "gz", "ax", "ay", "az")}
     pyarrow.parquet.write_table(pyarrow.table(alike), tmp_path / "bomb.parquet")
-    monkeypatch.setattr(_table_mat, "LIMIT", 8 << 20)
+    monkeypatch.setattr(table_mat, "LIMIT", 8 << 20)
     tracemalloc.start()
     with pytest.raises(DataError, match=f"unpacks to {7 * 8 << 20} bytes"):
         list(table.read(tmp_path / "bomb.parquet"))

@@ -9,11 +9,11 @@ import scipy.io
 from support.tables import write_csv
 
 from imutool.converters import table
-from imutool.converters._table_dates import calendar_times
-from imutool.converters._table_files import kind_of, load
-from imutool.converters._table_names import name_and_unit
-from imutool.converters._table_propose import propose
-from imutool.converters._table_text import Columns
+from imutool.converters._tables.columns.propose import propose
+from imutool.converters._tables.files.formats import kind_of, load
+from imutool.converters._tables.text.dates import calendar_times
+from imutool.converters._tables.text.delimited import Columns
+from imutool.converters._tables.text.names import name_and_unit
 from imutool.errors import ConfigError, DataError
 
 COUNT = 400
@@ -309,7 +309,7 @@ def test_an_object_of_matlab_hides_no_array_that_is_too_large(tmp_path, monkeypa
     scipy.io.savemat(tmp_path / "log.mat", {"zeros": np.zeros(10_000)}, do_compression=True)
     with (tmp_path / "log.mat").open("ab") as file:
         file.write(object_of_matlab(tmp_path))
-    monkeypatch.setattr("imutool.converters._table_mat.LIMIT", 50_000)
+    monkeypatch.setattr("imutool.converters._tables.files.mat.LIMIT", 50_000)
     with pytest.raises(DataError, match="unpacks to"):
         load(tmp_path / "log.mat", "mat")
 

@@ -12,7 +12,7 @@ import pytest
 from support.tables import write_csv
 
 from imutool.converters import table
-from imutool.converters._table_recordings import LONGEST_LABEL
+from imutool.converters._tables.recordings.several import LONGEST_LABEL
 from imutool.errors import ConfigError, DataError
 
 NAMES = [*(f"gyro_{a} (rad/s)" for a in "xyz"), *(f"acc_{a} (m/s^2)" for a in "xyz")]

@@ -14,7 +14,8 @@ import scipy.io
 from support.spreadsheet import write_xlsx
 from support.tables import write_csv
 
-from imutool.converters import _table_parts, table
+from imutool.converters import table
+from imutool.converters._tables.recordings import parts as table_parts
 
 COUNT, PARTS, RATE_HZ = 200, 3, 50.0
 RNG = np.random.default_rng(7)
@@ -326,7 +327,7 @@ def test_arrays_that_can_be_of_one_recording_alone_are_not_read_to_list_it(
 ) -> None:
     path = tmp_path / f"one.{ENDINGS.get(write, 'mat')}"
     write(path, {"time_s": T_S[:COUNT]} | {name: each[:COUNT] for name, each in NAMES.items()})
-    monkeypatch.setattr(_table_parts, "load", lambda *_: pytest.fail("read"))
+    monkeypatch.setattr(table_parts, "load", lambda *_: pytest.fail("read"))
     assert [each.name for each in table.sequences(path)] == ["one"]
     write(path, {"trial": PART} | NAMES)
     with pytest.raises(pytest.fail.Exception, match="read"):

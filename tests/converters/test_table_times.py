@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
 from imutool.converters import sensor_tables, table
-from imutool.converters._table_numbers import plain_columns
+from imutool.converters._tables.text.numbers import plain_columns
 from imutool.errors import ConfigError, DataError
 
 RATE_HZ = 250.0

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
 from imutool.converters import table
-from imutool.converters._table_headerless import as_table
-from imutool.converters._table_names import split_name
-from imutool.converters._table_units import raw_counts
+from imutool.converters._tables.columns.headerless import as_table
+from imutool.converters._tables.columns.units import raw_counts
+from imutool.converters._tables.text.names import split_name
 from imutool.errors import ConfigError, DataError
 from imutool.recording.gyro_steps import unit_by_steps
 

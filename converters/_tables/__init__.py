@@ -1,0 +1,1 @@
+"""Tables of numbers. Rooms, lowest first: text, columns, files, recordings."""

@@ -1,0 +1,1 @@
+"""What columns hold: times, rates, accelerations, poses, and their units."""

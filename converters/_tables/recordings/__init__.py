@@ -1,0 +1,1 @@
+"""Recordings of one table, or of the tables of a folder."""

@@ -1,0 +1,1 @@
+"""Tables of text: delimiters, headers, numbers, dates, and the words in names of columns."""
