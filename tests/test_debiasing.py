@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -269,7 +270,7 @@ def test_what_was_checked_stands_in_the_log_and_in_the_report(source: Path, mode
     for check in ("all", "imu", "none"):
         out = tmp_path / f"{check}.mcap"
         verified = debias(source, out, model=model_file, check=check).rewrite.verified
-        assert json.loads(metadata(out)[-1][1]["verified"]) == verified._asdict()
+        assert json.loads(metadata(out)[-1][1]["verified"]) == msgspec.to_builtins(verified)
         assert verified.mode == check
         assert (verified.chunks_checked == verified.chunks) == (check == "all")
     with pytest.raises(ConfigError, match="check: unknown mode 'most'"):
