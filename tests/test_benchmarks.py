@@ -24,6 +24,26 @@ def test_a_benchmark_loads_and_prints_its_help(
     assert f"usage: {path.name}" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--left-out", "a.mcap", "--known", "rest"], "of made-up sensors"),
+        (["--model", "static", "a.mcap", "--rest", "8"], "of made-up sensors"),
+        (["--made-up", "2", "--rest", "0"], "no log to judge"),  # both have a stop
+        (["--left-out"], "no log to judge"),
+    ],
+)
+def test_consistency_says_what_it_cannot_judge(
+    arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It took no notice of such options, or printed nothing."""
+    monkeypatch.setattr(sys, "argv", ["consistency.py", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        benchmark("consistency").main()
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+
+
 def test_the_codec_benchmark_decodes_what_it_encodes() -> None:
     codec = benchmark("codec")
     count = 2 * codec.CHUNK + 1

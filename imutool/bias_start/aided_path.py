@@ -29,7 +29,7 @@ from imutool.geometry import quaternion
 from imutool.inertial.aids import GROUND, STOPS, Aids
 from imutool.inertial.inertial_filter import HUBER, POSITION, SIZE, TURN, VELOCITY, FilterSettings, State, update
 from imutool.inertial.preintegration import exp, hat
-from imutool.inertial.stationary import white_noise
+from imutool.inertial.stationary import CALM, white_noise
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses, seconds
 
@@ -122,7 +122,7 @@ class _Measurements:
         if aids.height is not None:
             given = aids.height
             mean, count = _window_mean(seconds(given.t_ns, int(imu.t_ns[0])), given.values, t_s, s.height_window_s)
-            noise = float(white_noise(given.values)[0])
+            noise = CALM * float(white_noise(given.values)[0])
             self._height = mean[:, 0]
             self._height_std = np.where(count > 0, np.sqrt(s.height_m**2 + noise**2 / np.maximum(count, 1)), np.inf)
         self.std = np.concatenate([[1.0], np.full(3, s.lever_m), np.full(3, mount_rad), [s.scale]])

@@ -92,13 +92,15 @@ def main() -> None:
     which.add_argument("--left-out", action="store_true")
     which.add_argument("--made-up", type=int, metavar="SENSORS")
     parser.add_argument("--rest", type=float, choices=RESTS_S, help="only made-up sensors with such a stop (s)")
-    parser.add_argument("--known", nargs="+", choices=KNOWN, default=[])
+    parser.add_argument("--known", nargs="+", choices=KNOWN, default=[], help="what the filter is told of made-up sensors")
     parser.add_argument("--start", action="append", choices=STARTS)
     parser.add_argument("--each-log", action="store_true")
     parser.add_argument("--factor", action="store_true")
     parser.add_argument("--learned", action="store_true")
     parser.add_argument("--turn-error", type=float, help="share of a turn, in place of the calibration's own")
     options = parser.parse_args()
+    if not options.made_up and (options.known or options.rest is not None):
+        parser.error("--known and --rest are of made-up sensors: give --made-up")
     found: dict[tuple[str, str], list[Judgement]] = defaultdict(list)
     starts = options.start or STARTS
     cases = made_up(options.made_up, options.rest) if options.made_up else recorded(options.logs, options.model)
@@ -110,6 +112,8 @@ def main() -> None:
                 found[start, quantity].append(one)
                 if options.each_log and len(one.error):
                     print(f"{start:7}{quantity:16}{case.recording.name:24}", told([one]), flush=True)
+    if not found:
+        parser.error("no log to judge")
     for start in starts:
         for (of, quantity), logs in found.items():
             if of == start:

@@ -49,8 +49,8 @@ class Drawn(NamedTuple):
 def main() -> None:
     """Shares of the errors within the ellipsoids, of the gyro's bias and of both biases."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--stops", action="store_true")
+    parser.add_argument("--runs", type=int, default=100, help="logs of a minute")
+    parser.add_argument("--stops", action="store_true", help="each log has two stops")
     options = parser.parse_args()
     squares: dict[tuple[str, int], list[float]] = defaultdict(list)
     for seed in range(options.runs):

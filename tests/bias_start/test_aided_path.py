@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from support import driven
 from support.driven import R_VB, Drive
 
-from imutool.bias_start.aided_path import aided_path
+from imutool.bias_start.aided_path import AidSettings, aided_path
 from imutool.bias_start.prior_width import BiasPrior
 from imutool.errors import DataError
 from imutool.inertial.aids import Aids, Odometry
+from imutool.inertial.inertial_filter import update
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses, Scalars
 from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight, trajectory
@@ -150,6 +152,22 @@ def test_a_barometer_holds_the_height_though_its_offset_drifts() -> None:
     up = rms((aided.p_wb - true.p_wb)[:, 2])
     assert rms((pure.p_wb - true.p_wb)[:, 2]) > 3.0
     assert up < 0.3
+
+
+def test_a_barometer_has_the_whole_white_noise_of_its_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a mean over half a second; it had five sixths of the noise."""
+    imu, true = there_and_back()
+    t_ns, variances = imu.t_ns[::10], []
+
+    def told(*arguments: Any) -> Any:
+        variances.append(arguments[-1][0])
+        return update(*arguments)
+
+    monkeypatch.setattr("imutool.bias_start.aided_path.update", told)
+    height = true.p_wb[::10, 2] + 2.0 * np.random.default_rng(3).normal(size=len(t_ns))
+    aided_path(imu, StartPose.of(true), KNOWN, Aids({"barometer": ""}, height=Scalars(t_ns, height[:, None], "m")))
+    count = AidSettings().height_window_s / (1e-9 * np.median(np.diff(t_ns)))
+    assert np.median(variances) == pytest.approx(2.0**2 / count + AidSettings().height_m ** 2, rel=0.15)
 
 
 def test_a_gap_of_samples_breaks_nothing(drive: Drive) -> None:
