@@ -406,6 +406,14 @@ def test_poses_show_that_a_sensor_is_late_and_filters_nothing(effects: dict[str,
     assert sorted(names(found)) == sorted(effects)
 
 
+def test_filters_that_poses_cannot_show_leave_room_for_what_they_do_show() -> None:
+    """Three of them promised most, none was an answer, and the search ended before it came to the scale."""
+    truth = {"low_pass": [60.0], "gyro_scale": [0.005, -0.005, 0.005]}
+    pair = replace(planted.pair(trembling(9.0), truth), band_hz=7.0)
+    candidates = [one for one in candidates_for([pair]) if one.name == "low_pass" or one.key == "gyro_scale"]
+    assert names(select_effects([planted.weighed(pair)], candidates)) == ["gyro_scale"]
+
+
 # ── log_p_value ──
 
 
