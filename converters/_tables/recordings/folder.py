@@ -34,7 +34,7 @@ from ..files.npz import npy_shape, read_npy
 from ..files.sensors import SENSORS, SPACED, name_columns, sensors_among
 from ..text.delimited import LOOKED_AT, Columns, is_text_table, read_csv, text_of
 from ..text.header import MOSTLY
-from ..text.names import TIME_WORDS, is_named_time, leaf_of, name_and_unit, split_name
+from ..text.names import TIME_WORDS, is_named_time, leaf_of, listed, name_and_unit, split_name
 from ..text.packed import read_bytes, table_name
 from .look import look, recorded_apart
 from .roles import POSES, Names, role_folders, role_groups, shared_names, without_role
@@ -63,13 +63,9 @@ def sequences_below(source: Path) -> list[Sequence]:
     others = [folder for folder, own in found.items() if sequences and not own and folder not in parts]
     named = [each for each in others if re.fullmatch(rf"{POSES}|(.*_)?poses?", re.sub(SPACED, "_", each.name).lower())]
     if true := [f"{path.parent.name}/{path.name}" for each in named for path in _tables(each) or _arrays(each)]:
-        note = f"tables of true poses in a folder without an IMU are left out: {_listed(true)}"
+        note = f"tables of true poses in a folder without an IMU are left out: {listed(true, MAX_NAMED)}"
         logger.warning("%s: %s. Put each next to the tables of its IMU, with ground_truth in its name", source, note)
     return sequences
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:MAX_NAMED]) + (f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else "")
 
 
 def _sequences_in(folder: Path) -> list[Sequence]:
@@ -91,7 +87,7 @@ def _sequences_in(folder: Path) -> list[Sequence]:
     )
     unread = [path.relative_to(folder).as_posix() for path, is_table in zip(others, shown, strict=True) if is_table]
     if found and unread:  # settings in JSON are none, and damaged ones are told of
-        logger.warning("%s: tables that show no IMU are left out: %s", folder, _listed(unread))
+        logger.warning("%s: tables that show no IMU are left out: %s", folder, listed(unread, MAX_NAMED))
     places = {name: (next(iter(tables)), "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
     return [Sequence(folder.name if len(found) == 1 else name, *place) for name, place in places.items()]
 

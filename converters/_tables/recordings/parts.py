@@ -22,7 +22,7 @@ from ..._source import head
 from ..columns.times import is_counter
 from ..columns.wraps import MIN_ROWS, begun_anew
 from ..files.formats import kind_of, load, may_hold_several
-from ..text.delimited import Columns, no_numbers
+from ..text.delimited import Columns
 from ..text.names import group_of, is_named_time, is_of_recordings, is_of_sensors, leaf_of, tells_apart
 from .several import distinct, groups_apart, part_name, renamed
 
