@@ -294,9 +294,7 @@ class Attachment:
         """
         start, end = self.offset + HEAD.size, self.offset + self.length - 4
         (stated,) = struct.unpack("<I", source.at(end, 4))
-        if not stated:
-            return False
-        if (crc := crc_of(source, start, end)) != stated:
+        if stated and (crc := crc_of(source, start, end)) != stated:
             what = f"the attachment at byte {self.offset} is damaged: its CRC is {crc:08x}"
             raise LogError(what, expected=f"{stated:08x}", fix=SAVE)
-        return True
+        return bool(stated)
