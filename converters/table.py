@@ -98,6 +98,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
         turns = *table.quaternion_wxyz, *table.roll_pitch_yaw, *matrix_columns(table.rotation_matrix)
         used |= {table.truth_time, *table.position, *turns}
     scalars, constants = _further(columns, tables, {column.removeprefix("-") for column in used}, place)
+    remarks.losses.extend(sequence.losses)
     log = MessageLog(
         sequence.name,
         path.name,

@@ -45,7 +45,7 @@ def recordings_in(found: Sequence) -> list[Sequence]:
         parts = _recordings(found.path) if several else {}
     except (ConfigError, DataError):  # said when it is read
         return [found]
-    return [Sequence(f"{found.name}_{name}", found.path, name) for name in parts] if len(parts) > 1 else [found]
+    return [Sequence(f"{found.name}_{name}", found.path, name, found.losses) for name in parts] if len(parts) > 1 else [found]
 
 
 def load_table(path: Path, inside: str) -> Columns:
