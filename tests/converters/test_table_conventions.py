@@ -315,7 +315,7 @@ def test_a_refusal_says_how_many_columns_it_does_not_list(tmp_path):
 def test_a_matrix_with_as_many_columns_as_an_image_is_left_out_and_named(tmp_path):
     """It was left out without a word."""
     scipy.io.savemat(tmp_path / "log.mat", {"data": RNG.normal(0.0, 1.0, (COUNT, 65))})
-    with pytest.raises(DataError, match=f"no columns of numbers; data is left out: it has 65 columns and {COUNT} rows"):
+    with pytest.raises(DataError, match="no columns of numbers; data is left out: it has 65 columns, as an image"):
         table.read_sequence(table.sequences(tmp_path / "log.mat")[0])
 
 

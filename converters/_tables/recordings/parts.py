@@ -24,6 +24,7 @@ from ..columns.wraps import MIN_ROWS, begun_anew
 from ..files.formats import kind_of, load, may_hold_several
 from ..text.delimited import Columns
 from ..text.names import group_of, is_named_time, is_of_recordings, is_of_sensors, leaf_of, tells_apart
+from ..text.numbers import no_numbers
 from .several import distinct, groups_apart, part_name, renamed
 
 NOT_BACK, UP = 0.99, 0.5  # shares of the steps of a time that do not go back, and that go on

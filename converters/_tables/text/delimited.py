@@ -89,10 +89,9 @@ class Columns:
                 for column, values in zip(matrix_columns(name), array.reshape(-1, 9).T, strict=True):
                     self.values[column], self.units[column] = values, unit
             return
-        if array.ndim == 2 and array.shape[0] < array.shape[1]:
-            array = array.T
+        array = array.T if array.ndim == 2 and array.shape[0] < array.shape[1] else array
         if array.ndim == 2 and array.shape[1] > WIDEST:
-            self.remarks.losses.append(f"{name} is left out: it has {array.shape[1]} columns and {len(array)} rows, as an image")
+            self.remarks.losses.append(f"{name} is left out: it has {array.shape[1]} columns, as an image")
         elif array.ndim == 2 and array.shape[1] > 1:
             for number in range(array.shape[1]):
                 self.values[f"{name}[{number}]"], self.units[f"{name}[{number}]"] = array[:, number], unit
