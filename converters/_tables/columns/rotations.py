@@ -193,8 +193,8 @@ def _angle_units(columns: Columns, three: list[str]) -> list[str]:
 
 
 def unit_by_poses(columns: Columns, entries: Entries) -> str:
-    """Unit in which the gyro turns as far as the poses; empty where none does, and of counts with a zero of their own."""
-    if not entries.keys() & TURNS or are_unsigned_counts(columns.side_by_side(entries["gyro"])):
+    """Unit in which the gyro turns as far as the poses; empty where none does."""
+    if not entries.keys() & TURNS or are_unsigned_counts(columns.side_by_side(entries["gyro"])):  # with a zero of their own
         return ""
     q_wxyz, gyro = rotations(columns, entries), _GyroTurns.of(columns, entries)
     at_s = seconds_of(columns, (str(entries["truth_time"]), str(entries["truth_time_unit"])))
