@@ -25,7 +25,8 @@ from pathlib import Path
 class Sequence:
     """Sequence found but not read.
 
-    `path` is a folder, an archive or a bag; `inside` is the sequence's folder in the archive.
+    `path` is a folder, an archive or a bag; `inside` is the sequence's folder in the archive. `losses` say what beside it is in
+    no sequence.
 
     Small and picklable, so that it can be handed to a worker process.
     """
@@ -33,6 +34,7 @@ class Sequence:
     name: str
     path: Path
     inside: str = ""
+    losses: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.path}/{self.inside}" if self.inside else str(self.path)

@@ -33,9 +33,9 @@ from ._archive import (
 from ._source import each_path, head, named_folder
 from ._tables.files.formats import kind_of
 from ._tables.recordings.folder import ENDINGS as TABLES
+from ._tables.recordings.folder import logger
 from ._tables.text.packed import is_packed_alone, pieces, table_name
 
-logger = logging.getLogger(__package__)
 TAR = ".tar"  # in .xz, .bz2 or .zst; a .tar.gz is an archive itself
 MAX_NESTED = 3  # archives in archives
 SHARE = 2  # at most one part in two of the free disk: the log needs its place, too

@@ -53,13 +53,13 @@ from ._tables.recordings.folder import load_split, sequences_below
 from ._tables.recordings.parts import load_table, recordings_in, refuse_joined
 from ._tables.text.dates import said_epoch
 from ._tables.text.delimited import Columns, matrix_columns
-from ._tables.text.names import topic_of
+from ._tables.text.names import listed, topic_of
 from ._tables.text.packed import table_name
 
 unpacked = _unpacking.unpacked  # `convert` asks for it where no converter reads a source as it is
 GENERAL = True
 MAX_SCALARS = 200  # further columns that become topics
-MAX_LOSSES = 8  # in a refusal
+MAX_LOSSES, MAX_LISTED = 8, 20  # in a refusal, of columns in a remark
 POSES_TOPIC = "/ground_truth/pose"
 
 
@@ -98,6 +98,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
         turns = *table.quaternion_wxyz, *table.roll_pitch_yaw, *matrix_columns(table.rotation_matrix)
         used |= {table.truth_time, *table.position, *turns}
     scalars, constants = _further(columns, tables, {column.removeprefix("-") for column in used}, place)
+    remarks.losses.extend(sequence.losses)
     log = MessageLog(
         sequence.name,
         path.name,
@@ -134,7 +135,7 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks, given: Entries) ->
     maps = []
     for topic, proposal in proposals.items():
         if proposal.open:
-            names = ", ".join([column for column in columns.values if not column.startswith(COUNTED)][:40])
+            names = listed([column for column in columns.values if not column.startswith(COUNTED)], 2 * MAX_LISTED)
             more = f"; and {len(remarks.losses) - MAX_LOSSES} more losses" if len(remarks.losses) > MAX_LOSSES else ""
             reasons = "; ".join(proposal.reasons + remarks.losses[:MAX_LOSSES]) + more
             raise ConfigError(
@@ -282,10 +283,10 @@ def _further(
             constants[column] = str(columns.values[column].tolist())
         else:
             numbers.append(column)
-    notes = (f"{clock} stays apart from the IMU's clock: {', '.join(names[:20])}" for clock, names in separate.items())
+    notes = (f"{clock} stays apart from the IMU's clock: {listed(names, MAX_LISTED)}" for clock, names in separate.items())
     columns.remarks.notes.extend(notes)
     if numbers:
-        columns.remarks.losses.append(f"columns of another length, without a time, are left out: {', '.join(numbers[:20])}")
+        columns.remarks.losses.append(f"columns of another length, without a time, are left out: {listed(numbers, MAX_LISTED)}")
     if (over := len(clocks) - MAX_SCALARS) > 0:
         columns.remarks.losses.append(f"the table has {len(clocks)} further columns: {over} of them are left out")
     scalars: dict[str, Scalars] = {}

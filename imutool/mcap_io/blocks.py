@@ -26,6 +26,7 @@ CHUNK = int(Opcode.CHUNK)  # a plain number is compared ten times as fast
 HEAD_BYTES = 128  # hold a Chunk record up to its packed data, whatever its compression is called
 RUN_BYTES = 1 << 20  # messages outside chunks are read in runs of about this size
 MAX_TEXT = 1 << 16  # bytes of an attachment's name or media type
+SAVE = "imutool repair saves the rest of the log"
 
 
 class RecordSpan(NamedTuple):
@@ -259,7 +260,7 @@ class Attachment:
         def part(size: int) -> bytes:
             nonlocal at
             if size > min(end - at, MAX_TEXT):
-                raise LogError(f"the attachment at byte {offset} is damaged: its lengths contradict one another")
+                raise LogError(f"the attachment at byte {offset} is damaged: its lengths contradict one another", fix=SAVE)
             at += size
             return source.at(at - size, size)
 
@@ -270,7 +271,7 @@ class Attachment:
         name, media_type = text(), text()
         (size,) = struct.unpack("<Q", part(8))
         if size + 4 != end - at:
-            raise LogError(f"the attachment at byte {offset} is damaged: its data have {size} bytes")
+            raise LogError(f"the attachment at byte {offset} is damaged: its data have {size} bytes", fix=SAVE)
         return Attachment(offset, HEAD.size + length, log_time, create_time, name, media_type, size)
 
     def index_at(self, offset: int) -> AttachmentIndex:
@@ -293,8 +294,7 @@ class Attachment:
         """
         start, end = self.offset + HEAD.size, self.offset + self.length - 4
         (stated,) = struct.unpack("<I", source.at(end, 4))
-        if not stated:
-            return False
-        if (crc := crc_of(source, start, end)) != stated:
-            raise LogError(f"the attachment at byte {self.offset} is damaged: its CRC is {crc:08x}", expected=f"{stated:08x}")
-        return True
+        if stated and (crc := crc_of(source, start, end)) != stated:
+            what = f"the attachment at byte {self.offset} is damaged: its CRC is {crc:08x}"
+            raise LogError(what, expected=f"{stated:08x}", fix=SAVE)
+        return bool(stated)

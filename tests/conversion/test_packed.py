@@ -155,8 +155,8 @@ def test_a_folder_of_packed_logs_alone_becomes_a_log_for_each(log: Path) -> None
 def test_a_log_is_not_written_over_its_packed_source(log: Path) -> None:
     log.write_bytes(zstandard.compress(log.read_bytes()))
     before = log.read_bytes()
-    for out in (log, log.parent):
-        with pytest.raises(ConfigError, match="is the source itself"):
+    for out, why in ((log, "is the source itself"), (log.parent, "would replace the source")):
+        with pytest.raises(ConfigError, match=why):
             convert(log, out, overwrite=True)
     assert log.read_bytes() == before
     assert left(log.parent) == ["walk.mcap"]

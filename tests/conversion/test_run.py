@@ -370,7 +370,7 @@ def outside(monkeypatch):
     module.read = lambda source: (Recording(name, imu) for name in source.read_text().split())
     known, real = registry.names, registry.load
     monkeypatch.setattr(registry, "names", lambda group: [*known(group), "outside"])
-    monkeypatch.setattr(registry, "load", lambda group, name: module if name == "outside" else real(group, name))
+    monkeypatch.setattr(registry, "load", lambda group, name, *at: module if name == "outside" else real(group, name, *at))
     return module
 
 

@@ -92,7 +92,8 @@ def test_a_damaged_attachment_is_refused(convert, tmp_path):
     source.write_bytes(source.read_bytes().replace(b"gain: 1", b"gain: 2"))
     done = convert(source, tmp_path / "out.mcap")
     assert done.returncode == 5
-    assert "the attachment at byte" in done.stderr
+    assert f"{source}: the attachment at byte" in done.stderr
+    assert "imutool repair saves the rest" in done.stderr
 
 
 def _append(path: Path, records: bytes) -> None:

@@ -139,9 +139,10 @@ def test_publish_times_and_topics_in_other_encodings_arrive(convert, tmp_path, m
     done = convert(bag, tmp_path / "out.mcap")
     assert done.returncode == 3
     assert f"/left/imu (0 of {COUNT})" in done.stderr
-    assert "attachments are not carried over: rig.yaml" in done.stderr
     with (tmp_path / "out.mcap").open("rb") as raw:
         every = [(c.topic, m.log_time - m.publish_time) for _, c, m in make_reader(raw).iter_messages()]
+        raw.seek(0)
+        assert [(each.name, each.data) for each in make_reader(raw).iter_attachments()] == [("rig.yaml", b"gain: 1")]
     assert Counter(every) == {("/load", 7): COUNT, ("/notes", 9): COUNT}
     assert "float64 load" in messages_of(tmp_path / "out.mcap")[1]["/load"]
 

@@ -305,6 +305,20 @@ def test_arrays_beside_an_object_of_matlab_are_read_and_the_object_is_named(tmp_
     assert [loss.partition(".")[0] for loss in columns.remarks.losses] == ["its MATLAB objects are left out"]
 
 
+def test_a_refusal_says_how_many_columns_it_does_not_list(tmp_path):
+    names = np.array([f"s{number}" for number in range(65)], dtype=object)
+    scipy.io.savemat(tmp_path / "log.mat", {"data": RNG.normal(0.0, 1.0, (COUNT, 65)), "labels": names})
+    with pytest.raises(ConfigError, match=r"data/s0, .*, data/s39 and 25 more\. Give"):
+        table.read_sequence(table.sequences(tmp_path / "log.mat")[0])
+
+
+def test_a_matrix_with_as_many_columns_as_an_image_is_left_out_and_named(tmp_path):
+    """It was left out without a word."""
+    scipy.io.savemat(tmp_path / "log.mat", {"data": RNG.normal(0.0, 1.0, (COUNT, 65))})
+    with pytest.raises(DataError, match="no columns of numbers; data is left out: it has 65 columns, as an image"):
+        table.read_sequence(table.sequences(tmp_path / "log.mat")[0])
+
+
 def test_an_object_of_matlab_hides_no_array_that_is_too_large(tmp_path, monkeypatch):
     scipy.io.savemat(tmp_path / "log.mat", {"zeros": np.zeros(10_000)}, do_compression=True)
     with (tmp_path / "log.mat").open("ab") as file:

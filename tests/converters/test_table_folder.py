@@ -289,7 +289,7 @@ def test_a_file_with_arrays_of_different_lengths_beside_tables_is_left_out(tmp_p
 
 
 @pytest.mark.parametrize("suffix", ["", ".npy"])
-def test_a_folder_of_arrays_for_each_sensor_is_a_table_for_each(tmp_path, caplog, suffix):
+def test_a_folder_of_arrays_for_each_sensor_is_a_table_for_each(tmp_path, suffix):
     """Arrays are known by their first bytes: comma2k19 has them in files without a suffix, and its poses apart."""
     turn = GYRO + TURN[:, None]  # so that gravity shows the unit
     arrays = {
@@ -307,14 +307,13 @@ def test_a_folder_of_arrays_for_each_sensor_is_a_table_for_each(tmp_path, caplog
     (tmp_path / "drive" / "IMU" / "gyro" / "notes").write_text("no array")
     (sequence,) = table.sequences(tmp_path)
     assert sequence.name == "IMU"
-    (told,) = [line.getMessage() for line in caplog.records]
-    assert f"global_pose/frame_positions{suffix}. Put each next to the tables of its IMU" in told
     log = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"})
     np.testing.assert_array_equal(log.imus["/imu0"].gyro, turn)
     np.testing.assert_array_equal(log.imus["/imu0"].accel, ACCEL)
     assert len(log.scalars["/magnetometer_value_2"].t_ns) == COUNT // 10
     assert {topic.split("_")[0] for topic in log.scalars} == {"/magnetometer", "/gyro"}
-    assert not log.remarks.losses
+    (loss,) = log.remarks.losses
+    assert f"global_pose/frame_positions{suffix}. Put each next to the tables of its IMU" in loss
     (tmp_path / "drive" / "IMU" / "gyro" / f"value{suffix}").write_bytes(b"\x93NUMPY\x01\x00")
     with pytest.raises(DataError, match=rf"gyro/value{suffix}: cannot be read"):
         table.read_sequence(sequence)
@@ -582,10 +581,28 @@ def test_what_lies_beside_an_imu_and_is_not_read_is_named(tmp_path, caplog):
     write_csv(
         tmp_path / "ground-truth" / "pose.csv", [f"{value}.5" for value in range(8)], [T_S, *RNG.normal(0, 1, (7, COUNT))]
     )
-    assert len(table.sequences(tmp_path)) == 1
-    told = "\n".join(line.getMessage() for line in caplog.records)
-    assert "tables that show no IMU are left out: imu0_resampled.npy" in told
-    assert "true poses in a folder without an IMU are left out: ground-truth/pose.csv" in told
+    (sequence,) = table.sequences(tmp_path)
+    assert "tables that show no IMU are left out: imu0_resampled.npy" in "\n".join(r.getMessage() for r in caplog.records)
+    (loss,) = table.read_sequence(sequence).remarks.losses
+    assert "true poses in a folder without an IMU are left out: ground-truth/pose.csv" in loss
+
+
+@pytest.mark.parametrize("name", ["walk2_gt.csv", "walk2_gt.txt"])
+def test_poses_whose_recording_lies_in_no_table_are_a_loss(tmp_path, name):
+    """They were named in a line of the logger, and the exit code was 0."""
+    names = ["t [s]", *(f"g{a} [rad/s]" for a in "xyz"), *(f"a{a} [m/s^2]" for a in "xyz")]
+    for recording in ("walk1", "walk3"):
+        write_csv(tmp_path / f"{recording}_imu.csv", names, [T_S, *GYRO.T, *ACCEL.T])
+    poses = [T_S, *RNG.normal(0.0, 1.0, (3, COUNT)), *np.tile([[0.0], [0.0], [0.0], [1.0]], COUNT)]
+    for path in ("walk1_gt.csv", name):
+        write_csv(tmp_path / path, ["t", "x", "y", "z", "qx", "qy", "qz", "qw"], poses)
+    if name.endswith(".txt"):  # a trajectory without a header
+        text = (tmp_path / name).read_text().replace(",", " ")
+        (tmp_path / name).write_text(text.partition("\n")[2])
+    first, second = table.sequences(tmp_path)
+    (loss,) = table.read_sequence(first).remarks.losses
+    assert loss == f"{tmp_path}: tables of poses or of an IMU that belong to no recording are left out: {name}"
+    assert not table.read_sequence(second).remarks.losses
 
 
 def test_an_array_that_a_description_names_has_the_poses_of_the_imu_beside_it(tmp_path):

@@ -554,6 +554,24 @@ def test_a_sensors_own_time_counts_and_not_the_uneven_one_of_the_program(tmp_pat
     assert any(f"{names[1]!r} is the sensor's own time and steadier" in note for note in log.remarks.notes)
 
 
+@pytest.mark.parametrize(("name", "per_s"), [("time_usec", 1e6), ("HIGHRES_IMU.time_usec", 1e6), ("time_boot_ms", 1e3)])
+def test_the_device_s_time_counts_in_what_mavlogdump_writes_and_not_that_of_the_receiver(tmp_path, name, per_s):
+    """The stamps of the receiver jitter by the link's delay."""
+    arrived = 1_700_000_000.0 + T_S + np.abs(RNG.normal(0.0, 0.0015, COUNT))
+    axes = [*(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    own = np.rint((50.0 + T_S) * per_s).astype(int)
+    log = read(write_csv(tmp_path / "imu.csv", ["timestamp", name, *axes], [arrived, own, *GYRO.T, *ACCEL.T]))
+    assert np.array_equal(log.imus["/imu0"].t_ns, own * round(1e9 / per_s))
+
+
+def test_poses_show_no_unit_of_counts_with_a_zero_of_their_own(tmp_path):
+    """The gyro of a converter from 0 to 1023, whose count is 0.95 deg/s, was said to be in deg/s."""
+    counts = [np.rint(370.0 + values).astype(int) for values in (np.rad2deg(GYRO / 0.95).T, 100.0 * ACCEL.T / 9.81 + 140.0)]
+    scipy.io.savemat(tmp_path / "trial.mat", {"t": T_S, "gyr": counts[0].T, "acc": counts[1].T, "q_gt": Q_WXYZ})
+    with pytest.raises(ConfigError, match=r'gyro_unit = "\?"'):
+        read(tmp_path / "trial.mat")
+
+
 def test_a_time_in_the_last_column_is_one_by_its_century(tmp_path):
     path = write_csv(
         tmp_path / "imu.txt", ["1"] * 9, [GYRO[:, 0] * 0.0, GYRO[:, 0] * 0.0, *GYRO.T, *ACCEL.T, 1_700_000_000.0 + T_S]

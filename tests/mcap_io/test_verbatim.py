@@ -318,9 +318,9 @@ def test_a_chunk_that_is_not_looked_into_is_not_called_checked(source: Path, tmp
     }
     new = reports["all"].chunks - chunks
     assert new > 0
-    assert reports["none"] == ("none", imu, chunks + new)
-    assert reports["imu"] == ("imu", imu + new, chunks + new)
-    assert reports["all"] == ("all", chunks + new, chunks + new)
+    assert reports["none"] == Verified("none", imu, chunks + new)
+    assert reports["imu"] == Verified("imu", imu + new, chunks + new)
+    assert reports["all"] == Verified("all", chunks + new, chunks + new)
 
 
 def test_all_finds_the_damage_that_the_others_pass_on(source: Path, tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ from .wraps import begun_anew
 
 MAX_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
 SENSOR_TIME = r"(.*_)?(sensor|event|hardware|hw|device|imu)_?(event_?)?(time|t_|ts|stamp)"  # next to the time of the program
+OF_MAVLINK = r"time_(usec|boot_ms)$"  # the same, next to the receiver's `timestamp`
 
 
 def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns: Columns, given: Entries) -> None:
@@ -159,7 +160,8 @@ def _repeated_times(found: list[str], columns: Columns, proposal: Proposal) -> d
 
 def _steadiest_first(found: list[str], spelled: dict[str, tuple[str, str]], columns: Columns, proposal: Proposal) -> list[str]:
     """Times of the samples, a sensor's own before a program's that is less even."""
-    own = [c for c in found[1:] if re.match(SENSOR_TIME, spelled[c][1]) and not _table_of(c)]
+    named = [c for c in found[1:] if re.match(SENSOR_TIME, spelled[c][1]) or re.search(OF_MAVLINK, c)]
+    own = [c for c in named if not _table_of(c)]
     if not own or _unevenness(columns.values[own[0]]) >= _unevenness(columns.values[found[0]]):
         return found
     proposal.reasons.append(f"{own[0]!r} is the sensor's own time and steadier than {found[0]!r}: it counts as the time")

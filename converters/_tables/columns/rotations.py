@@ -17,7 +17,7 @@ from imutool.recording import interpolate
 
 from ..text.delimited import Columns
 from .map import Entries
-from .units import ANGLE_SI, GYRO_SI, TIME_NS
+from .units import ANGLE_SI, GYRO_SI, TIME_NS, are_unsigned_counts
 
 SPAN_S, LONG_SPAN_S = 0.1, 0.3  # over which turns are compared; over the second, noise of the poses is a smaller part
 MAX_SPANS, MIN_S = 5.0, 5.0  # multiple of a span that has a gap in it, and the least time to compare
@@ -194,7 +194,7 @@ def _angle_units(columns: Columns, three: list[str]) -> list[str]:
 
 def unit_by_poses(columns: Columns, entries: Entries) -> str:
     """Unit in which the gyro turns as far as the poses; empty where none does."""
-    if not entries.keys() & TURNS:
+    if not entries.keys() & TURNS or are_unsigned_counts(columns.side_by_side(entries["gyro"])):  # with a zero of their own
         return ""
     q_wxyz, gyro = rotations(columns, entries), _GyroTurns.of(columns, entries)
     at_s = seconds_of(columns, (str(entries["truth_time"]), str(entries["truth_time_unit"])))

@@ -12,6 +12,7 @@ import logging
 import re
 from collections import Counter
 from contextlib import suppress
+from dataclasses import replace
 from itertools import chain, islice
 from pathlib import Path
 
@@ -34,7 +35,7 @@ from ..files.npz import npy_shape, read_npy
 from ..files.sensors import SENSORS, SPACED, name_columns, sensors_among
 from ..text.delimited import LOOKED_AT, Columns, is_text_table, read_csv, text_of
 from ..text.header import MOSTLY
-from ..text.names import TIME_WORDS, is_named_time, leaf_of, name_and_unit, split_name
+from ..text.names import TIME_WORDS, is_named_time, leaf_of, listed, name_and_unit, split_name
 from ..text.packed import read_bytes, table_name
 from .look import look, recorded_apart
 from .roles import POSES, Names, role_folders, role_groups, shared_names, without_role
@@ -63,13 +64,10 @@ def sequences_below(source: Path) -> list[Sequence]:
     others = [folder for folder, own in found.items() if sequences and not own and folder not in parts]
     named = [each for each in others if re.fullmatch(rf"{POSES}|(.*_)?poses?", re.sub(SPACED, "_", each.name).lower())]
     if true := [f"{path.parent.name}/{path.name}" for each in named for path in _tables(each) or _arrays(each)]:
-        note = f"tables of true poses in a folder without an IMU are left out: {_listed(true)}"
-        logger.warning("%s: %s. Put each next to the tables of its IMU, with ground_truth in its name", source, note)
+        lost = f"{source}: tables of true poses in a folder without an IMU are left out: {listed(true, MAX_NAMED)}"
+        fix = "Put each next to the tables of its IMU, with ground_truth in its name"
+        sequences[0] = replace(sequences[0], losses=(*sequences[0].losses, f"{lost}. {fix}"))
     return sequences
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:MAX_NAMED]) + (f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else "")
 
 
 def _sequences_in(folder: Path) -> list[Sequence]:
@@ -89,11 +87,20 @@ def _sequences_in(folder: Path) -> list[Sequence]:
     shown = (
         kind in ("csv", "") or (kind != "json" and (look(path).header or look(path).has_time)) for path, kind in others.items()
     )
-    unread = [path.relative_to(folder).as_posix() for path, is_table in zip(others, shown, strict=True) if is_table]
-    if found and unread:  # settings in JSON are none, and damaged ones are told of
-        logger.warning("%s: tables that show no IMU are left out: %s", folder, _listed(unread))
+    unread = {p.relative_to(folder).as_posix(): _is_of_motion(p) for p, is_table in zip(others, shown, strict=True) if is_table}
+    motions, unknown = ([name for name, is_motion in unread.items() if is_motion == wanted] for wanted in (True, False))
+    if unknown:  # settings in JSON are none, and damaged ones are told of
+        logger.warning("%s: tables that show no IMU are left out: %s", folder, listed(unknown, MAX_NAMED))
+    lost = [f"{folder}: tables of poses or of an IMU that belong to no recording are left out: {listed(motions, MAX_NAMED)}"]
     places = {name: (next(iter(tables)), "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
-    return [Sequence(folder.name if len(found) == 1 else name, *place) for name, place in places.items()]
+    sequences = [Sequence(folder.name if len(found) == 1 else name, *place) for name, place in places.items()]
+    return [replace(each, losses=tuple(lost if motions and not n else [])) for n, each in enumerate(sequences)]
+
+
+def _is_of_motion(path: Path) -> bool:
+    """Whether a table shows an IMU or poses, or is named as one of true poses."""
+    seen = look(path)
+    return seen.is_imu or seen.has_poses or re.fullmatch(POSES, re.sub(SPACED, "_", _stem(path)).lower()) is not None
 
 
 def load_split(folder: Path, recording: str) -> Columns:

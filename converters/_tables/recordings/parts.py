@@ -22,8 +22,9 @@ from ..._source import head
 from ..columns.times import is_counter
 from ..columns.wraps import MIN_ROWS, begun_anew
 from ..files.formats import kind_of, load, may_hold_several
-from ..text.delimited import Columns, no_numbers
+from ..text.delimited import Columns
 from ..text.names import group_of, is_named_time, is_of_recordings, is_of_sensors, leaf_of, tells_apart
+from ..text.numbers import no_numbers
 from .several import distinct, groups_apart, part_name, renamed
 
 NOT_BACK, UP = 0.99, 0.5  # shares of the steps of a time that do not go back, and that go on
@@ -45,7 +46,7 @@ def recordings_in(found: Sequence) -> list[Sequence]:
         parts = _recordings(found.path) if several else {}
     except (ConfigError, DataError):  # said when it is read
         return [found]
-    return [Sequence(f"{found.name}_{name}", found.path, name) for name in parts] if len(parts) > 1 else [found]
+    return [Sequence(f"{found.name}_{name}", found.path, name, found.losses) for name in parts] if len(parts) > 1 else [found]
 
 
 def load_table(path: Path, inside: str) -> Columns:

@@ -27,6 +27,7 @@ from .numbers import (
     decimal_points,
     fields_of,
     is_number,
+    no_numbers,
     numbers,
     plain_columns,
     vector,
@@ -88,10 +89,11 @@ class Columns:
                 for column, values in zip(matrix_columns(name), array.reshape(-1, 9).T, strict=True):
                     self.values[column], self.units[column] = values, unit
             return
-        if array.ndim == 2 and array.shape[0] < array.shape[1]:
-            array = array.T
-        if array.ndim == 2 and array.shape[1] > 1:
-            for number in range(array.shape[1] if array.shape[1] <= WIDEST else 0):
+        array = array.T if array.ndim == 2 and array.shape[0] < array.shape[1] else array
+        if array.ndim == 2 and array.shape[1] > WIDEST:
+            self.remarks.losses.append(f"{name} is left out: it has {array.shape[1]} columns, as an image")
+        elif array.ndim == 2 and array.shape[1] > 1:
+            for number in range(array.shape[1]):
                 self.values[f"{name}[{number}]"], self.units[f"{name}[{number}]"] = array[:, number], unit
         elif array.size > 1:
             self.values[name], self.units[name] = array.reshape(-1), unit
@@ -282,12 +284,6 @@ def add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> None
         )
     else:
         columns.add_labels(name, texts)
-
-
-def no_numbers(name: str, texts: list[str]) -> str:
-    """Sentence on a column of texts, which is left out."""
-    wrong = next((text for text in texts if text and not is_number(text)), texts[0])
-    return f"{name} is left out: its fields, as {wrong[:40]!r}, are no numbers"
 
 
 def _width(rows: list[list[str]], above: list[list[str]]) -> int:

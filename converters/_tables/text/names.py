@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from functools import lru_cache
 
 XSENS_TIME = r"sample_?time_?fine"  # counts 100 us
 SI_WORDS = r"angular_?velocity|linear_?acceleration|gyro_rad_|accelerometer_m_s2_|gyro_?rotation"  # of ROS, PX4 and CoreMotion
 TIME_WORDS = (
-    rf"({XSENS_TIME}|times?|time_?interval|timestamps?|time_?stamps?|t|ts|cts|stamp|seconds|seconds_?elapsed|sec|epoch?|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
+    rf"({XSENS_TIME}|times?|time_?interval|timestamps?|time_?stamps?|t|ts|cts|stamp|seconds|seconds_?elapsed|sec|epoch?|rosbagtimestamp|time_?(s|ms|us|ns|sec|boot)"
     r"|zeit|zeitstempel|uhrzeit|date_?time|utc|[a-z]*(nanos|micros|millis)|elapsed|(gps_?)?(tow|time_?of_?week))"
     r"(_since_?(boot|reboot|start|epoch|1970))?"
 )
@@ -233,7 +233,7 @@ def split_name(column: str) -> tuple[str, str]:
     name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")
     if not unit and (
         end := re.search(
-            rf"(?:_in)?_({RATE_OR_FORCE_UNITS}|gs?|ns|us|ms|s|(nano|micro|milli)?sec(ond)?s?)$",
+            rf"(?:_in)?_({RATE_OR_FORCE_UNITS}|gs?|ns|us|ms|s|(nano|micro|milli|u)?sec(ond)?s?)$",
             name,
         )
     ):
@@ -275,3 +275,8 @@ def topic_of(column: str, taken: Collection[str], notes: list[str]) -> str:
             topic = f"{topic}_{len(taken)}"
         notes.append(f"{column!r} is on {topic}")
     return topic
+
+
+def listed(names: Sequence[str], limit: int) -> str:
+    """The first names, and how many more there are."""
+    return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")

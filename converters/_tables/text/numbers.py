@@ -136,3 +136,9 @@ def _number(text: str) -> float | None:
         return None if "_" in text else float(text)
     except ValueError:
         return None
+
+
+def no_numbers(name: str, texts: list[str]) -> str:
+    """Sentence on a column of texts, which is left out."""
+    wrong = next((text for text in texts if text and not is_number(text)), texts[0])
+    return f"{name} is left out: its fields, as {wrong[:40]!r}, are no numbers"
