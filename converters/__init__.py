@@ -25,7 +25,7 @@ from pathlib import Path
 class Sequence:
     """Sequence found but not read.
 
-    `path` is a folder, an archive or a bag; `inside` is the sequence's folder in the archive. `losses` say what beside it is in
+    `path` is a folder, an archive or a bag; `inside` is the sequence's folder in the archive. `losses` name what is in
     no sequence.
 
     Small and picklable, so that it can be handed to a worker process.

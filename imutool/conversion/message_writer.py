@@ -26,7 +26,6 @@ from imutool.mcap_io.codec.encode import encode_imu, encode_pose
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.codec.transforms import Transforms
 from imutool.mcap_io.file_writer import Chunk, LogWriter
-from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
 from imutool.mcap_io.write import (
     BODY,
@@ -36,6 +35,7 @@ from imutool.mcap_io.write import (
     MessageBuffer,
     Series,
     chunks,
+    copy_attachment,
     scalar_series,
     velocity_series,
 )
@@ -77,9 +77,7 @@ def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", 
             series = Series(log.channel(topic, schemas.IMU), log_times, (imu.t_ns, imu.gyro, imu.accel), _encode_body)
             for chunk in chunks([series]):
                 log.chunk(chunk)
-        for place in source.attachments:
-            with (origin := Source(place.path)).file:
-                log.attachment(origin, place.offset, place.length)
+        source.remarks.losses.extend(filter(None, (copy_attachment(log, place) for place in source.attachments)))
         check_kinds(source, stream.channels, _write_trajectories(log, source, stream.paths))
         if not log.contents.counts.total():
             raise DataError("holds no messages", where=source.name, expected="a log with data")

@@ -16,7 +16,7 @@ from imutool.conversion.corrections import Corrections
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.shared_corrections import most_alike, shared
 from imutool.conversion.user_labels import Labels
-from imutool.errors import ConfigError, DataError, ImutoolError, LogError
+from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.file_location import first_bytes
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.joined_imu import JOIN_VECTORS, unread_fix
@@ -163,8 +163,6 @@ def _convert_one(job: Job) -> Outcome:
         known = error.where is not None and str(job.sequence.path) in error.where
         where = str(job.sequence) if error.where is None else f"{job.sequence}: {error.where}"
         return Outcome(error if known else type(error)(error.what, where=where, expected=error.expected, fix=error.fix))
-    except LogError as error:  # of an attachment, which is read when the log is written
-        return Outcome(error.at(job.sequence))
     except ImutoolError as error:
         return Outcome(error)
 

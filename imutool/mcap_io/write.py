@@ -18,14 +18,15 @@ import numpy as np
 
 import imutool
 from imutool.array_types import Int64, Shaped, UInt8
-from imutool.errors import DataError
+from imutool.errors import DataError, LogError
 from imutool.file_location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
 from imutool.mcap_io.file_writer import Chunk, LogWriter
+from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.topics import KIND_KEY, UNIT_KEY, VELOCITY_KEY
 from imutool.recording import Frames, Poses, Recording, Scalars
-from imutool.recording.message_log import DOUBTFUL, named_kind
+from imutool.recording.message_log import DOUBTFUL, Attachment, named_kind
 
 CHUNK_BYTES = 1 << 20  # compression gains nothing beyond, memory grows tenfold by 32 MiB (mcap#1658)
 RECORD = "imutool"  # name of our metadata record
@@ -243,3 +244,13 @@ def _shadowed(text: str) -> Mapping[str, str] | None:
     except ValueError:
         value = None
     return value if isinstance(value, dict) and all(isinstance(v, str) for v in value.values()) else None
+
+
+def copy_attachment(log: LogWriter, place: Attachment) -> str:
+    """Copy an attachment of another log; of a damaged one, which is left out, what is wrong."""
+    try:
+        with (origin := Source(place.path)).file:
+            log.attachment(origin, place.offset, place.length)
+    except LogError as error:
+        return f"{error.what}; it is left out"
+    return ""

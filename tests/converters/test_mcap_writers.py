@@ -87,13 +87,17 @@ def test_metadata_of_one_name_and_attachments_are_kept(convert, tmp_path, option
         log.check()
 
 
-def test_a_damaged_attachment_is_refused(convert, tmp_path):
+def test_a_damaged_attachment_is_a_loss(convert, tmp_path):
     source = write_log(tmp_path / "in.mcap", beside=True)
     source.write_bytes(source.read_bytes().replace(b"gain: 1", b"gain: 2"))
     done = convert(source, tmp_path / "out.mcap")
-    assert done.returncode == 5
-    assert f"{source}: the attachment at byte" in done.stderr
-    assert "imutool repair saves the rest" in done.stderr
+    assert done.returncode == 3
+    assert "the attachment at byte" in done.stderr
+    assert "it is left out" in done.stderr
+    with (tmp_path / "out.mcap").open("rb") as file:
+        assert list(make_reader(file).iter_attachments()) == []
+    with Log(tmp_path / "out.mcap") as log:
+        log.check()
 
 
 def _append(path: Path, records: bytes) -> None:

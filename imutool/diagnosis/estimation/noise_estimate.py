@@ -184,14 +184,11 @@ def axis_squares(found: Fit, only: Collection[WhitenedLog] = ()) -> Axes:
 
 def leaves_slow_motion(found: Fit, sensor: str, squares: float) -> bool:
     """Whether a fit leaves more than some squares on a sensor, where a body moves."""
-    return slow_squares(found, sensor) > squares
+    return float(_slow_squares(found)[found.logs[0].pair.signals[sensor]].sum()) > squares
 
 
-def slow_squares(found: Fit, sensor: str) -> float:
-    """Squares of white residuals of a sensor above noise, up to the frequency of a body.
-
-    That is `motion_hz`.
-    """
+def _slow_squares(found: Fit) -> Axes:
+    """Squares of white residuals above noise by axis, below the frequency `motion_hz` up to which a body moves."""
     total = np.zeros(found.logs[0].pair.columns)
     for log, r, b in zip(found.logs, found.residuals, found.bias, strict=True):
         settings, residual = log.pair.settings, r - log.constants * b
@@ -200,7 +197,7 @@ def slow_squares(found: Fit, sensor: str) -> float:
             residual = sosfiltfilt(butter(SLOW_ORDER, slow, output="sos"), residual, axis=0)
         rows = residual[log.rows(found.part)]
         total += np.maximum((rows**2).sum(axis=0) - settings.search.white_chi_square * min(slow, 1.0) * len(rows), 0.0)
-    return float(total[found.logs[0].pair.signals[sensor]].sum())
+    return total
 
 
 def kurtosis(found: Fit) -> Axes:

@@ -14,7 +14,6 @@ from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import expected
-from imutool.diagnosis.estimation.noise_estimate import slow_squares
 from imutool.diagnosis.estimation.significance import bic, parameter_cost
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.recording import GRAVITY_M_S2
@@ -132,10 +131,7 @@ def with_steady_clock(base: Fit, named: Sequence[Effect], starts: Starts) -> Fit
 
 
 def with_plainer_effects(base: Fit, named: Sequence[Effect]) -> Fit:
-    """Fit with the plainer of two effects where the other is not clearly better (BIC).
-
-    A filter of one sensor has to explain more than its lag does, by more than it leaves: else it is of another form.
-    """
+    """Fit with the plainer of two effects where the other is not clearly better (BIC)."""
     poses = any(log.pair.band_hz is not None for log in base.logs)
     for complex_one, theta in base.chosen:
         sizes = _plainer(complex_one, theta, poses=poses)
@@ -143,8 +139,6 @@ def with_plainer_effects(base: Fit, named: Sequence[Effect]) -> Fit:
         plainer = [effect for effect in named if effect.key in sizes and effect.key not in base.keys]
         parts = [(with_free(e, sizes[e.name][0], complex_one.sensors), np.array(sizes[e.name][1])) for e in plainer]
         margin = base.logs[0].pair.settings.search.clearly_better * max(1.0, base.reduced_chi_square)
-        if parts and complex_one.lagless is not None and len(complex_one.sensors) == 1:
-            margin = max(margin, slow_squares(base, complex_one.sensors[0]))
         limits = [bic(base) + margin - parameter_cost(base, (*rest, part)) for part in parts]
         trials = [fit(base.logs, (*rest, part), near=base, give_up_above=at) for part, at in zip(parts, limits, strict=True)]
         best = min(trials, key=bic, default=base)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from scipy.signal import butter, iirnotch, lfilter, sosfilt
+from scipy.signal import butter, sosfilt
 from scipy.special import gammaincc
 from scipy.stats import chi2
 from support import planted
@@ -875,14 +875,6 @@ def test_a_gyro_that_is_ahead_is_plainer_than_a_clock_and_a_filter() -> None:
     delay = next(of for of in planted.catalogue() if of.key == "gyro_delay")
     now = fit(logs, ((delay, np.array([-0.001])),))
     assert with_filter_of_each_sensor(now, planted.catalogue()) is now
-
-
-def test_a_notch_filter_of_the_gyro_is_no_low_pass_but_its_lag() -> None:
-    """Its loss near its frequency had the cut-off of a low-pass, and a gyro ahead of it."""
-    felt = trembling(9.0)
-    notched = lfilter(*iirnotch(12.0, 3.0, fs=planted.RATE_HZ), felt.gyro - felt.gyro[0], axis=0) + felt.gyro[0]
-    added = np.concatenate([notched - felt.gyro, np.zeros_like(felt.gyro)], axis=1)
-    assert names(asked(planted.pair(felt, added=added), beyond=False)) == ["gyro_delay"]
 
 
 def test_a_filter_of_each_sensor_that_shows_its_lag_alone_has_no_order_by_chance() -> None:

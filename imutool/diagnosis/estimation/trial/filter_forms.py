@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
-from imutool.diagnosis.estimation.noise_estimate import leaves_slow_motion, slow_squares
+from imutool.diagnosis.estimation.noise_estimate import leaves_slow_motion
 from imutool.diagnosis.estimation.observability import LOW_PASSES, WANDER, beyond_the_band, exclude_each_other
 from imutool.diagnosis.estimation.significance import bic
 from imutool.diagnosis.estimation.trial.effect_forms import digital, exponential
@@ -110,8 +110,7 @@ def with_delay_of_accel(base: Fit, named: Sequence[Effect], *, complete: bool = 
 
     A late accelerometer is a clock that is late, and a gyro that is ahead of it. One alone of these two explains little, so
     that the search finds the low-pass of this lag, or of slow motion a hysteresis. A hysteresis, and against a
-    simulation a first order, has one number, and stays unless it is clearly worse. What a `complete` fit leaves may be of a
-    filter of another form.
+    simulation a first order, has one number, and stays unless it is clearly worse. What a `complete` fit leaves is noise.
     """
     both = [of for key in ("clock_offset", "gyro_delay") for of in named if of.key == key and key not in base.keys]
     for k, (effect, theta) in enumerate(base.chosen):
@@ -122,7 +121,7 @@ def with_delay_of_accel(base: Fit, named: Sequence[Effect], *, complete: bool = 
             plainer = effect.name == HYSTERESIS or (_is_simulated(base.logs) and effect.name == LOW_PASSES[0])
             slack = settings.clearly_better * (-1.0 if plainer else 1.0)
             if complete and effect.name != HYSTERESIS:
-                slack = max(slack * base.reduced_chi_square, slow_squares(base, "accel"))
+                slack *= base.reduced_chi_square
             trial = fit(base.logs, late, near=base, give_up_above=base.objective + max(0.0, slack))
             if bic(trial) >= bic(base) + slack:
                 return base
