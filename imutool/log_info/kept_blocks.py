@@ -12,13 +12,14 @@ import numpy as np
 from imutool.cleaning.samples import BLOCK, Samples
 
 ROW_BYTES = 64  # of a sample: two times and six values; its message has some 350
+MAX_ROWS = 1 << 21  # 128 MiB, three hours at 200 Hz: a folder of temporary files may lie in memory
 LAST_NS = 2**63 - 1
 
 
 class KeptBlocks:
     """Blocks of samples in a file without a name.
 
-    Where the system gives none, or no room, nothing is kept.
+    Of more than `MAX_ROWS` samples, or where the system gives no file or no room, nothing is kept.
     """
 
     def __init__(self) -> None:
@@ -28,15 +29,20 @@ class KeptBlocks:
     def add(self, samples: Samples) -> None:
         """Keep the next block; each but the last has `BLOCK` samples."""
         table = np.column_stack([samples.log_ns, samples.stamp_ns, samples.values.view(np.int64)])
+        is_first, self._rows = not self._rows, self._rows + len(table)
         try:
-            if not self._rows:
+            if is_first:
                 self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  closed with this object
                 weakref.finalize(self, self._file.close)
-            if self._file is not None and self._file.write(table.tobytes()) != table.nbytes:
-                self._file = None
+            if self._file is not None and (self._rows > MAX_ROWS or self._file.write(table.tobytes()) != table.nbytes):
+                self._drop()
         except OSError:
-            self._file = None
-        self._rows += len(table)
+            self._drop()
+
+    def _drop(self) -> None:
+        if self._file is not None:
+            self._file.close()
+        self._file = None
 
     def read(self, start_ns: int | None, end_ns: int | None) -> Iterator[Samples] | None:
         """The samples with log times from `start_ns` to `end_ns`, both included; None where they are not kept."""

@@ -113,6 +113,8 @@ def test_a_chunk_is_unpacked_once_for_all_imus(tmp_path: Path, monkeypatch: pyte
     found = inspect(tmp_path / "log.mcap")
     with Log(tmp_path / "log.mcap") as log:
         assert count[0] == 2 * len(log.index.blocks)  # to check it, and to read the IMUs; it was 7
+    monkeypatch.setattr(kept_blocks, "MAX_ROWS", 1)
+    assert inspect(tmp_path / "log.mcap") == found, "of many samples the log is read again"
     monkeypatch.setattr(kept_blocks.tempfile, "TemporaryFile", no_file)
     assert inspect(tmp_path / "log.mcap") == found, "without a temporary file the log is read again"
     assert count[0] > 4 * len(log.index.blocks)
