@@ -145,12 +145,12 @@ class _Search(Trial):
         allowed = self.searched + (self.unnamed if unnamed_count(base) < settings.max_unnamed else ())
         allowed, error = tuple(effect for effect in allowed if effect.key not in but_for), LowPassError.of(base)
         best: tuple[float, Fit] | None = None
-        refused = set[str]()  # promise more than chance explains, and are no answer: the next ones take their places
+        poses, unsure, filters = any(log.pair.band_hz is not None for log in self.logs), set[str](), set[str]()
         for promised, effect, start, gain in self.candidates.ranked(base, allowed, count)[:count]:
             if best is not None and promised > best[0] * (1.0 if effect.linear else share):
                 continue  # the score of a linear effect is its gain
-            if promised < self.threshold:
-                refused.add(effect.key)
+            if poses and effect.lagless is not None:
+                filters.add(effect.key)
             if effect.name == WANDER and gain < self.settings.unnamed_share * (base.objective - base.numbers):
                 continue  # errors of poses last for seconds, as it does
             if effect.key not in self.trials:
@@ -166,10 +166,12 @@ class _Search(Trial):
                 and own_log_p < self.threshold
                 and error.may_be(added_effect, base, trial, log_p, self.threshold)
             ):
+                unsure.add(effect.key)
                 continue
             best = (own_log_p, trial) if best is None or own_log_p < best[0] else best
         if best is None or best[0] > self.threshold:
-            return self.added(base, but_for | refused) if refused else None
+            no_answer = filters | unsure if best is None else filters  # poses hardly show filters, which promise alike
+            return self.added(base, but_for | no_answer) if no_answer else None
         limit = settings.unnamed_share * (self.before - base.numbers)
         if unnamed_count(best[1]) and base.objective - best[1].objective < limit:
             return None  # the rim of something that has no name: a name for it would be wrong
