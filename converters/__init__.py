@@ -25,8 +25,8 @@ from pathlib import Path
 class Sequence:
     """Sequence found but not read.
 
-    `path` is a folder, an archive or a bag; `inside` is the sequence's folder in the archive. `losses` name what is in
-    no sequence.
+    `path` is a folder, an archive or a bag; `inside` is the sequence's folder in the archive. `losses` name what is left out
+    of all sequences of the source.
 
     Small and picklable, so that it can be handed to a worker process.
     """

@@ -81,14 +81,20 @@ def test_small_angles_without_a_unit_are_no_positions(tmp_path):
     assert any("lat and lon state neither deg nor rad" in note for note in log.remarks.notes)
 
 
-@pytest.mark.parametrize("head", ["latitude [deg],longitude [deg],altitude [m]", "easting,northing,height"])
-def test_positions_on_the_earth_beside_quaternions_in_a_world_with_z_up_are_east_north_up(tmp_path, head):
-    """As those of GNSS next to the orientation of an IMU that ROS has."""
+def turned_imu(folder: Path) -> Rotation:
+    """Rotations in a world with z up; the table of an IMU that reads them lies in the folder."""
     rotation = Rotation.from_euler("ZYX", ANGLES[:, ::-1])
     turns = (rotation[:-1].inv() * rotation[1:]).as_rotvec() * 100.0
     imu = "time [s],gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s],acc_x [m/s^2],acc_y [m/s^2],acc_z [m/s^2]\n"
     force = rotation.inv().apply([0.0, 0.0, 9.81])
-    (tmp_path / "imu.csv").write_text(imu + rows(T_S, np.concatenate([turns, turns[-1:]]), force))
+    (folder / "imu.csv").write_text(imu + rows(T_S, np.concatenate([turns, turns[-1:]]), force))
+    return rotation
+
+
+@pytest.mark.parametrize("head", ["latitude [deg],longitude [deg],altitude [m]", "easting,northing,height"])
+def test_positions_on_the_earth_beside_quaternions_in_a_world_with_z_up_are_east_north_up(tmp_path, head):
+    """As those of GNSS next to the orientation of an IMU that ROS has."""
+    rotation = turned_imu(tmp_path)
     enu = NED[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
     latitude, longitude = 0.9 + NED[:, 0] / 6.37e6, 0.2 + NED[:, 1] / (6.39e6 * np.cos(0.9))
     place = enu if "easting" in head else np.stack([np.degrees(latitude), np.degrees(longitude), enu[:, 2]], axis=1)
@@ -101,11 +107,7 @@ def test_positions_on_the_earth_beside_quaternions_in_a_world_with_z_up_are_east
 @pytest.mark.parametrize("world", ["ecef", "utm"])
 def test_poses_about_the_centre_of_the_earth_become_east_north_up(tmp_path, world):
     """As comma2k19 has them. Northings of UTM are as large in Denmark, and stay."""
-    rotation = Rotation.from_euler("ZYX", ANGLES[:, ::-1])
-    turns = (rotation[:-1].inv() * rotation[1:]).as_rotvec() * 100.0
-    imu = "time [s],gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s],acc_x [m/s^2],acc_y [m/s^2],acc_z [m/s^2]\n"
-    force = rotation.inv().apply([0.0, 0.0, 9.81])
-    (tmp_path / "imu.csv").write_text(imu + rows(T_S, np.concatenate([turns, turns[-1:]]), force))
+    rotation = turned_imu(tmp_path)
     enu = NED[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
     earth = Rotation.from_euler("ZX", [LONGITUDE + np.pi / 2.0, np.pi / 2.0 - LATITUDE])  # from east, north, up
     place = ecef(LATITUDE, LONGITUDE, HEIGHT_M) + earth.apply(enu) if world == "ecef" else np.array([5e5, 6.36e6, 0.0]) + enu

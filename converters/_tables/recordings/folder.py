@@ -91,10 +91,12 @@ def _sequences_in(folder: Path) -> list[Sequence]:
     motions, unknown = ([name for name, is_motion in unread.items() if is_motion == wanted] for wanted in (True, False))
     if unknown:  # settings in JSON are none, and damaged ones are told of
         logger.warning("%s: tables that show no IMU are left out: %s", folder, listed(unknown, MAX_NAMED))
-    lost = [f"{folder}: tables of poses or of an IMU that belong to no recording are left out: {listed(motions, MAX_NAMED)}"]
     places = {name: (next(iter(tables)), "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
     sequences = [Sequence(folder.name if len(found) == 1 else name, *place) for name, place in places.items()]
-    return [replace(each, losses=tuple(lost if motions and not n else [])) for n, each in enumerate(sequences)]
+    if motions:
+        lost = f"{folder}: tables of poses or of an IMU that belong to no recording are left out: {listed(motions, MAX_NAMED)}"
+        sequences[0] = replace(sequences[0], losses=(lost,))
+    return sequences
 
 
 def _is_of_motion(path: Path) -> bool:
