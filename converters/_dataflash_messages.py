@@ -29,6 +29,7 @@ TEXT_TYPES = {**TYPES, "M": "S16"}  # a mode is written by its name
 TEXT_SCALES = {**dict.fromkeys("cCeE", 100.0), "L": 1e7}  # of binary integers that text shows as decimals
 CLOCKS_NS = {"TimeUS": 1000, "TimeMS": 1_000_000}
 NO_TIME = -1
+LONGEST = 200  # letters of a loss: it quotes what a damaged line has in a number's place
 
 
 class Messages(NamedTuple):
@@ -174,7 +175,7 @@ def _text_messages(raw: bytes, remarks: Remarks) -> dict[str, Messages]:
         errors: list[Exception] = []
         parts = list(_sound_parts(formats[name], rows, places[name], errors))
         if errors:
-            remarks.losses.append(f"{len(errors)} messages {name} are left out: {errors[0]}")
+            remarks.losses.append(f"{len(errors)} messages {name} are left out: {errors[0]}"[:LONGEST])
         if parts:
             arrays, kept = zip(*parts, strict=True)
             found[name] = _messages(np.concatenate(arrays), [place for part in kept for place in part])

@@ -63,6 +63,14 @@ def test_a_number_that_cannot_be_read_costs_its_own_message_alone(tmp_path):
     assert [len(imu) for imu in log.imus.values()] == [499, 500]
 
 
+def test_a_loss_does_not_quote_a_damaged_line_in_full(tmp_path):
+    path = write_dataflash(tmp_path / "1.log", text=True)
+    path.write_text(path.read_text().replace(", 0.2", ", 0." + "x" * 10**5, 1))
+    (loss,) = dataflash.read_sequence(dataflash.sequences(path)[0]).remarks.losses
+    assert "left out: could not convert string to float: '0.xxx" in loss
+    assert len(loss) == 200
+
+
 def test_names_that_differ_by_capitals_and_formats_of_one_name_are_kept_apart(convert, tmp_path):
     """As scripts log them; `g` is a float of two bytes."""
     formats = {201: (b"LUA", b"Qgg", b"TimeUS,Roll,roll"), 202: (b"LUA", b"QB", b"TimeUS,State")}
