@@ -10,6 +10,7 @@ Three = tuple[float, float, float]  # one number an axis
 SENSORS: tuple[Sensor, Sensor] = ("gyro", "accel")
 AXES = ("x", "y", "z")
 FULL_SCALE_RAD_S = 35.0  # 2000 degrees a second, the widest range of common MEMS gyros
+MAX_RATE_RAD_S = 1e4  # no gyro measures more
 NOUNS = {"gyro": "Angular rate", "accel": "Specific force"}
 UNITS = {"gyro": "rad/s", "accel": "m/s²"}  # as people read them
 ASCII_UNITS = {"gyro": "rad/s", "accel": "m/s^2"}  # as JSON and logs hold them

@@ -27,8 +27,9 @@ from imutool.mcap_io.read import read_recordings
 from imutool.mcap_io.temperature import with_temperatures
 from imutool.recording import GRAVITY_M_S2, Imu, Recording, nanoseconds, seconds
 from imutool.recording.columns import MAX_GAP_S, jump_warnings, quantile
+from imutool.units import MAX_RATE_RAD_S
 
-MAX = np.array([1e4] * 3 + [1e6] * 3)  # rad/s and m/s²: no gyro or accelerometer measures more
+MAX = np.array([MAX_RATE_RAD_S] * 3 + [1e6] * 3)  # rad/s and m/s²: no gyro or accelerometer measures more
 MIN_FORCE_M_S2 = 1e-9  # on some axis: even in free fall a sensor's noise exceeds it
 GRAVITY_RANGE = (0.4, 2.5)  # of the median specific force to gravity; a sensor in g has 0.1, a racing drone up to 2
 MAX_STRETCHES = 1000  # that a report lists

@@ -18,7 +18,7 @@ from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.recording import GAP_FACTOR, Imu, Recording, seconds
 from imutool.recording.columns import median, quantile
-from imutool.units import AXES
+from imutool.units import AXES, MAX_RATE_RAD_S
 
 logger = logging.getLogger(__name__)
 
@@ -68,9 +68,10 @@ class GyroTurns:
         self._first_ns, self._last_ns = 0, 0
         self._last: tuple[Float64[np.ndarray, "1 3"], Float64[np.ndarray, "1 3"]] | None = None  # rate, and turn so far
 
-    @np.errstate(over="ignore", invalid="ignore")  # of rates that no sensor reads
     def see(self, t_ns: Int64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"]) -> None:
-        """Add the next samples, in order of time."""
+        """Add the next samples, in order of time; rates that no gyro measures count as missing."""
+        sound = (np.abs(gyro) <= MAX_RATE_RAD_S).all(axis=1)
+        t_ns, gyro = t_ns[sound], gyro[sound]
         if not len(t_ns):
             return
         if self._last is None:

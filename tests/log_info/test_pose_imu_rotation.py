@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -50,6 +52,18 @@ def test_poses_of_the_same_motion_explain_the_gyro_whatever_its_mount_and_bias()
     assert np.abs(turned_deg - MOUNT.as_rotvec(degrees=True)).max() < 5 * std_deg.max()
     assert 0.001 < std_deg.max() < 0.5
     assert motion_warnings("/mocap", found.explained, found.rms_rad_s, found.jumps, found.largest_jump_deg) == []
+
+
+@pytest.mark.parametrize("wrong", [1e5, 1e30, 1.7e308])
+def test_rates_that_no_gyro_measures_count_as_missing(wrong: float) -> None:
+    samples = imu()
+    gyro = samples.gyro.copy()
+    gyro[[1000, 4000]] = wrong
+    found = agreement(poses(), dataclasses.replace(samples, gyro=gyro))
+    assert found is not None
+    assert found.explained > 0.999
+    assert found.jumps == 0
+    assert agreement(poses(), dataclasses.replace(samples, gyro=np.full_like(gyro, wrong))) is None
 
 
 def test_poses_that_turn_about_one_axis_show_no_mount() -> None:
