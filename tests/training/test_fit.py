@@ -225,6 +225,17 @@ def test_a_descent_that_only_harms_leaves_the_closed_form(recordings: list[Recor
     assert not weights["curve.gyro.net.4.weight"].any()
 
 
+def test_a_drift_that_runs_away_is_not_kept_however_well_it_scores(
+    recordings: list[Recording], uninterrupted: tuple[Training, list[Epoch]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = {epoch.sensor for epoch in uninterrupted[1] if epoch.step == 6 and epoch.held_out < epoch.before}
+    assert kept, "an end must be better than its beginning for the test to mean anything"
+    monkeypatch.setattr("imutool.training.fit.runs_away", lambda *_: True)
+    training = Training(recordings, "neural_ode", TINY)
+    first = {epoch.sensor: epoch.held_out for epoch in finish(training) if not epoch.step}
+    assert training.done == first
+
+
 @pytest.mark.parametrize(("pull", "away"), [(0.0, True), (-50.0, False)])
 def test_a_drift_that_carries_the_bias_away_in_an_hour_is_found(
     pull: float, away: bool, recordings: list[Recording], monkeypatch: pytest.MonkeyPatch
