@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -22,6 +22,7 @@ from imutool.units import Sensor
 LONGEST_S = {"gyro": 20.0, "accel": 5.0}
 HOP_S = 1.0
 HOUR_S = 3600.0
+AT_ONCE = 1_000_000  # samples of several logs in one pass
 
 
 def held_out_errors(
@@ -54,18 +55,38 @@ def runs_away(model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float[Tensor
     In an hour at rest, or in an hour of the log's motion, again and again. The logs are minutes long, and a field that is
     right for minutes may be wrong without bound. `rest` are their biases.
     """
-    columns = COLUMNS[sensor]
-    for log, bias in enumerate(rest):
-        rows = pool.log == log
-        t, motion = pool.t[rows] - pool.t[rows][0], torch.cat([pool.gyro[rows], pool.accel[rows]], dim=1)
-        at_rest = torch.cat([bias[:3], motion[:, 3:].mean(dim=0)]).expand_as(motion)
-        u, state = torch.stack([at_rest, motion]), bias.repeat(2, 1)  # both in one pass: four fifths of the time of two
-        for _ in range(math.ceil(HOUR_S / float(t[-1]))):
-            path = model.rest_bias(sensor, Segment(t.expand(2, -1), u[..., :3], u[..., 3:], state))
-            if (path - bias[columns]).abs().max() > TURN_ON_STD[sensor]:
-                return True
-            state[:, columns] = path[:, -1]
+    columns, counts = COLUMNS[sensor], [int((pool.log == log).sum()) for log in range(len(rest))]
+    for logs in _alike(counts):  # in one pass: a step of many takes hardly longer than of one
+        bias, n = rest[logs], counts[logs[0]]
+        t, u, passes = [], [], []
+        for log, start in zip(logs, bias, strict=True):
+            rows = pool.log == log
+            t_s, motion = pool.t[rows] - pool.t[rows][0], torch.cat([pool.gyro[rows], pool.accel[rows]], dim=1)
+            passes.append(math.ceil(HOUR_S / float(t_s[-1])))
+            at_rest = torch.cat([start[:3], motion[:, 3:].mean(dim=0)]).expand_as(motion)
+            beyond = torch.arange(n - len(motion), device=motion.device)  # up to the longest: nobody looks at it
+            last_s = t_s[-1] + (beyond + 1) * (t_s[-1] - t_s[0]) / (len(t_s) - 1)
+            t += [torch.cat([t_s, last_s])] * 2
+            u += [torch.cat([x, x[-1:].expand(len(beyond), -1)]) for x in (at_rest, motion)]
+        shared_t, shared_u, state = torch.stack(t), torch.stack(u), bias.repeat_interleave(2, dim=0)
+        for k in range(max(passes)):
+            path = model.rest_bias(sensor, Segment(shared_t, shared_u[..., :3], shared_u[..., 3:], state))
+            for j, log in enumerate(logs):
+                own = path[2 * j : 2 * j + 2, : counts[log]]
+                if k < passes[j] and (own - bias[j, columns]).abs().max() > TURN_ON_STD[sensor]:
+                    return True
+                state[2 * j : 2 * j + 2, columns] = own[:, -1]
     return False
+
+
+def _alike(counts: Sequence[int]) -> Iterator[list[int]]:
+    """Logs in groups, the longest first: each has at least half of the samples of its group's longest."""
+    waiting = sorted(range(len(counts)), key=lambda log: -counts[log])
+    while waiting:
+        longest = counts[waiting[0]]
+        alike = [log for log in waiting if 2 * counts[log] >= longest][: max(1, AT_ONCE // (2 * longest))]
+        waiting = waiting[len(alike) :]
+        yield alike
 
 
 def _windows(pool: Pool, sensor: Sensor) -> tuple[Int[Tensor, " m"], int]:

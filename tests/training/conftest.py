@@ -27,6 +27,14 @@ def one_start() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short_hour() -> Iterator[None]:
+    """A drift is looked at for five minutes: an hour is most of a small training, and test_fit.py has whole ones."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("imutool.training.held_out.HOUR_S", 300.0)
+        yield
+
+
 def _perfect(seed: int, **changes: Any) -> Recording:
     """Exact samples of an exact motion, and the exact truth at the samples' own stamps."""
     settings = msgspec.convert(

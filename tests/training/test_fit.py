@@ -14,6 +14,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from imutool.bias.model_file import load
+from imutool.bias.networks.network import Segment
 from imutool.bias.networks.threads import of_each, side_by_side
 from imutool.bias_start.bias_from_truth import from_truth
 from imutool.bias_start.correction import apply
@@ -25,8 +26,10 @@ from imutool.processes.forked import Forked, forking
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.training import checkpoint
+from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.fit import Epoch, Training, TrainSettings
-from imutool.training.held_out import runs_away
+from imutool.training.held_out import HOUR_S, runs_away
+from imutool.units import Sensor
 
 Make = Callable[..., Recording]
 TINY = TrainSettings(
@@ -222,8 +225,21 @@ def test_a_descent_that_only_harms_leaves_the_closed_form(recordings: list[Recor
     assert not weights["curve.gyro.net.4.weight"].any()
 
 
+def test_a_drift_that_runs_away_is_not_kept_however_well_it_scores(
+    recordings: list[Recording], uninterrupted: tuple[Training, list[Epoch]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = {epoch.sensor for epoch in uninterrupted[1] if epoch.step == 6 and epoch.held_out < epoch.before}
+    assert kept, "an end must be better than its beginning for the test to mean anything"
+    monkeypatch.setattr("imutool.training.fit.runs_away", lambda *_: True)
+    training = Training(recordings, "neural_ode", TINY)
+    first = {epoch.sensor: epoch.held_out for epoch in finish(training) if not epoch.step}
+    assert training.done == first
+
+
 @pytest.mark.parametrize(("pull", "away"), [(0.0, True), (-50.0, False)])
-def test_a_drift_that_carries_the_bias_away_in_an_hour_is_found(pull: float, away: bool, recordings: list[Recording]) -> None:
+def test_a_drift_that_carries_the_bias_away_in_an_hour_is_found(
+    pull: float, away: bool, recordings: list[Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """1e-5 rad/s² is nothing in a minute, and 0.036 rad/s in an hour; with a pull to a place near the logs it comes to rest."""
     training = Training(recordings, "neural_ode", TINY)
     rest = training.tracks.per_log().detach()
@@ -235,7 +251,26 @@ def test_a_drift_that_carries_the_bias_away_in_an_hour_is_found(pull: float, awa
         drift.get_submodule("out").weight[:, :3] = pull * torch.eye(3)  # type: ignore[index]
         drift.get_submodule("out").bias[:] = 0.1  # type: ignore[index]
         drift.get_buffer("centre")[:] = rest[:, :3].mean(0)
+    monkeypatch.setattr("imutool.training.held_out.HOUR_S", HOUR_S)
     assert runs_away(training.model, "gyro", training.pool, rest) is away
+
+
+@pytest.mark.parametrize("durations_s", [(6.0, 4.0), (4.0, 6.0), (6.0, 2.4)])
+@pytest.mark.parametrize(("share", "away"), [(0.98, False), (1.02, True)])
+def test_logs_in_one_pass_drift_as_long_as_each_alone(
+    monkeypatch: pytest.MonkeyPatch, durations_s: tuple[float, ...], share: float, away: bool
+) -> None:
+    """The longer log goes through twice while the shorter begins again at its own end."""
+    logs = [flight(k + 1, duration_s=duration_s, still_s=0.5) for k, duration_s in enumerate(durations_s)]
+    training = Training(logs, "linear", settings(model={}))
+    rate = share * TURN_ON_STD["gyro"] / 12.0
+
+    def drifted(sensor: Sensor, segment: Segment) -> torch.Tensor:
+        return segment.of(sensor)[1][:, None] + rate * segment.t[..., None]
+
+    monkeypatch.setattr(training.model, "rest_bias", drifted)
+    monkeypatch.setattr("imutool.training.held_out.HOUR_S", 11.9)  # whole passes of all these logs end at 12 s
+    assert runs_away(training.model, "gyro", training.pool, training.tracks.per_log().detach()) is away
 
 
 def test_a_loss_that_is_no_number_stops_the_training(recordings: list[Recording]) -> None:

@@ -193,7 +193,7 @@ def test_a_low_pass_is_found_although_the_clocks_offset_has_taken_its_lag() -> N
 
 
 def test_a_small_scale_is_told_beside_a_low_pass_by_slow_motion() -> None:
-    found = low_passed(0, (60.0, 90.0), scale=1.01)
+    found = low_passed(0, (60.0, 90.0), scale=1.01, duration_s=10.0)
     assert low_pass(found).std[0] < 0.01 * CUTOFF_HZ
     scales = {one.effect.name: one for one in found.selected[1:]}
     assert scales.keys() == {"gyro_scale", "accel_scale"}
