@@ -26,8 +26,9 @@ from imutool.diagnosis.estimation.observability import with_plainer_effects
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.estimation.trial import verdicts
 from imutool.diagnosis.estimation.trial.effect_forms import in_forms
-from imutool.diagnosis.estimation.trial.filter_forms import with_delay_of_accel, with_filter_of_each_sensor
+from imutool.diagnosis.estimation.trial.filter_forms import with_delay_of_accel
 from imutool.diagnosis.estimation.trial.selection import Selection
+from imutool.diagnosis.estimation.trial.sensor_filters import with_filter_of_each_sensor
 from imutool.diagnosis.estimation.trial.walking_bias import std_of_unseen_walk, with_bias_walk
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked
