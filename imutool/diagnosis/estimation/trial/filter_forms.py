@@ -82,9 +82,7 @@ def with_form_of_low_pass(base: Fit, named: Sequence[Effect]) -> Fit:
         two = _of_each_sensor(base, k, named)
         trial = fit(logs, two, near=base) if two else base
         if bic(trial) < bic(base) - settings.model_error_low_pass / error * max(settings.clearly_better, errs):
-            for sensor in SENSORS:  # a second order that only fits with an endless damping is a first one
-                trial = with_own_form(trial, (sensor,), named)
-            return with_form_of_low_pass(trial, named)
+            return with_form_of_low_pass(with_own_forms(trial, named), named)  # endless damping is of first order
     return base
 
 
@@ -137,13 +135,15 @@ def model_error(logs: Sequence[WhitenedLog]) -> float:
     return settings.model_error_denoised if any(log.pair.denoised for log in logs) else settings.model_error
 
 
-def with_own_form(base: Fit, sensors: tuple[str, ...], named: Sequence[Effect]) -> Fit:
-    """Fit with the filter of one sensor in another form, if better."""
-    k = next(k for k, (effect, _) in enumerate(base.chosen) if effect.name in LOW_PASSES and effect.sensors == sensors)
-    best, forms = base, [of for of in named if of.name in LOW_PASSES and of.sensors == sensors]  # the other may have another order
-    for chosen in _forms(base, k, forms):
-        trial = fit(base.logs, chosen, near=base, give_up_above=bic(best))
-        best = trial if form_bic(trial) < form_bic(best) and is_shown(trial) else best
+def with_own_forms(base: Fit, named: Sequence[Effect]) -> Fit:
+    """Fit with the filter of each sensor alone in another form, if better; the other sensor's may have another order."""
+    best = base
+    for sensors in ((sensor,) for sensor in SENSORS):
+        places = [k for k, (effect, _) in enumerate(best.chosen) if effect.name in LOW_PASSES and effect.sensors == sensors]
+        forms = [of for of in named if of.name in LOW_PASSES and of.sensors == sensors]
+        for chosen in [chosen for k in places for chosen in _forms(best, k, forms)]:
+            trial = fit(base.logs, chosen, near=best, give_up_above=bic(best))
+            best = trial if form_bic(trial) < form_bic(best) and is_shown(trial) else best
     return best
 
 

@@ -10,15 +10,16 @@ import numpy as np
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
-from imutool.diagnosis.estimation.observability import LOW_PASSES, WANDER, beyond_the_band
+from imutool.diagnosis.estimation.observability import LOW_PASSES, WANDER
 from imutool.diagnosis.estimation.trial.filter_forms import (
     cutoff_hz,
     form_bic,
+    is_shown,
     is_simulated,
     model_error,
     sensor_lag_s,
     taken,
-    with_own_form,
+    with_own_forms,
 )
 from imutool.sensor.effect import Effect
 from imutool.sensor.effects.second_order_low_pass import BUTTERWORTH
@@ -45,11 +46,7 @@ def with_filter_of_each_sensor(base: Fit, named: Sequence[Effect]) -> Fit:
     if not lags or (exact and len(lags) == 1 and base.keys[lags[0]] != "gyro_delay"):  # a form of its own is tried before
         return base
     begun = _with_filters(base, lags, {of.key: of for of in named}, LOW_PASSES[exact])
-    best = min((fit(logs, chosen, near=base) for chosen in begun), key=form_bic, default=base)
-    for effect, _ in best.chosen:
-        best = with_own_form(best, effect.sensors, named) if effect.name in LOW_PASSES and len(effect.sensors) == 1 else best
-    if any(beyond_the_band(*entry, logs) for entry in best.chosen if entry[0].name in LOW_PASSES):
-        return base
+    best = with_own_forms(min((fit(logs, chosen, near=base) for chosen in begun), key=form_bic, default=base), named)
     margin = logs[0].pair.settings.search.clearly_better
     if not exact:
         margin *= max(1.0, base.reduced_chi_square)
@@ -58,7 +55,7 @@ def with_filter_of_each_sensor(base: Fit, named: Sequence[Effect]) -> Fit:
     else:
         errs = model_error(logs) * sum(taken(base, k) for k in lags if base.chosen[k][0].name in LOW_PASSES)
         margin = max(margin, errs)
-    return best if form_bic(best) < form_bic(base) - margin else base
+    return best if is_shown(best) and form_bic(best) < form_bic(base) - margin else base
 
 
 def _lags_s(base: Fit, lags: Sequence[int]) -> dict[str, float]:
@@ -69,13 +66,13 @@ def _lags_s(base: Fit, lags: Sequence[int]) -> dict[str, float]:
 def _with_filters(base: Fit, lags: Sequence[int], named: Mapping[str, Effect], order: str) -> Iterator[Chosen]:
     """Effects with filters of one sensor or of each, and with a clock offset or none, for those that lag."""
     others, lag_s = tuple(entry for k, entry in enumerate(base.chosen) if k not in lags), _lags_s(base, lags)
+    damping = [BUTTERWORTH][: LOW_PASSES.index(order)]
     for sensors, with_clock in product((*combinations(SENSORS, 1), SENSORS), (True, False)):
-        keys = [f"{order}:{sensor}" for sensor in sensors]
-        if not {*keys, *([OFFSET] if with_clock else [])} <= named.keys():
-            continue
+        filters = [named.get(f"{order}:{sensor}") for sensor in sensors]
         rest = [lag_s[sensor] for sensor in SENSORS if sensor not in sensors] or [0.5 * min(lag_s.values())]
         clock_s = rest[0] if with_clock else 0.0
-        clock = [(named[OFFSET], np.array([-clock_s]))] if with_clock else []
-        own_s, damping = (max(lag_s[sensor] - clock_s, MIN_LAG_S) for sensor in sensors), [BUTTERWORTH][: LOW_PASSES.index(order)]
-        filters = ((named[key], np.array([cutoff_hz(named[key], damping, s), *damping])) for key, s in zip(keys, own_s, strict=True))
-        yield (*others, *clock, *filters)
+        own_s = [max(lag_s[sensor] - clock_s, MIN_LAG_S) for sensor in sensors]
+        clock = [(named[OFFSET], np.array([-clock_s]))] if with_clock and OFFSET in named else []
+        each = [(of, np.array([cutoff_hz(of, damping, s), *damping])) for of, s in zip(filters, own_s, strict=True) if of]
+        if len(each) == len(sensors) and len(clock) == with_clock:
+            yield (*others, *clock, *each)
