@@ -45,16 +45,17 @@ def with_filter_of_each_sensor(base: Fit, named: Sequence[Effect]) -> Fit:
     lags = [k for k, (effect, _) in enumerate(base.chosen) if effect.name in (LAGS if exact else LAGS_BY_POSES)]
     if not lags or (exact and len(lags) == 1 and base.keys[lags[0]] != "gyro_delay"):  # a form of its own is tried before
         return base
-    begun = _with_filters(base, lags, {of.key: of for of in named}, LOW_PASSES[exact])
-    best = with_own_forms(min((fit(logs, chosen, near=base) for chosen in begun), key=form_bic, default=base), named)
+    trials = list[Fit]()
+    for chosen in _with_filters(base, lags, {of.key: of for of in named}, LOW_PASSES[exact]):
+        trials.append(fit(logs, chosen, near=base, give_up_above=min(map(form_bic, trials), default=np.inf)))
+    best = with_own_forms(min(trials, key=form_bic, default=base), named)
     margin = logs[0].pair.settings.search.clearly_better
     if not exact:
         margin *= max(1.0, base.reduced_chi_square)
     elif len(best.prior) < len(base.prior) or min(_lags_s(base, lags).values()) < -AHEAD * logs[0].pair.period_s:
         margin = 0.0  # simpler; and no filter is ahead, but a clock may be
     else:
-        errs = model_error(logs) * sum(taken(base, k) for k in lags if base.chosen[k][0].name in LOW_PASSES)
-        margin = max(margin, errs)
+        margin = max(margin, model_error(logs) * sum(taken(base, k) for k in lags if base.chosen[k][0].name in LOW_PASSES))
     return best if is_shown(best) and form_bic(best) < form_bic(base) - margin else base
 
 
@@ -67,7 +68,7 @@ def _with_filters(base: Fit, lags: Sequence[int], named: Mapping[str, Effect], o
     """Effects with filters of one sensor or of each, and with a clock offset or none, for those that lag."""
     others, lag_s = tuple(entry for k, entry in enumerate(base.chosen) if k not in lags), _lags_s(base, lags)
     damping = [BUTTERWORTH][: LOW_PASSES.index(order)]
-    for sensors, with_clock in product((*combinations(SENSORS, 1), SENSORS), (True, False)):
+    for sensors, with_clock in product((SENSORS, *combinations(SENSORS, 1)), (True, False)):
         filters = [named.get(f"{order}:{sensor}") for sensor in sensors]
         rest = [lag_s[sensor] for sensor in SENSORS if sensor not in sensors] or [0.5 * min(lag_s.values())]
         clock_s = rest[0] if with_clock else 0.0
