@@ -106,20 +106,22 @@ def with_delay_of_accel(base: Fit, named: Sequence[Effect], *, complete: bool = 
     that the search finds the low-pass of this lag, or of slow motion a hysteresis. A hysteresis, and against a
     simulation a first order, has one number, and stays unless it is clearly worse. What a `complete` fit leaves is noise.
     """
-    both = [of for key in ("clock_offset", "gyro_delay") for of in named if of.key == key and key not in base.keys]
+    both = {key: of for key in ("clock_offset", "gyro_delay") for of in named if of.key == key}
+    now = {effect.key: theta for effect, theta in base.chosen}
     for k, (effect, theta) in enumerate(base.chosen):
         if len(both) == 2 and effect.name in (*LOW_PASSES, HYSTERESIS) and effect.sensors == ("accel",):
-            start = np.array([0.0 if effect.name == HYSTERESIS else -Design.of(effect, theta).lag_s])
-            late = (*base.chosen[:k], *base.chosen[k + 1 :], *((of, start) for of in both))
+            others, lag_s = (*base.chosen[:k], *base.chosen[k + 1 :]), sensor_lag_s(effect, theta, "accel")
+            late = [entry for entry in others if entry[0].key not in both]
+            late += [(of, now.get(key, np.zeros(1)) - lag_s) for key, of in both.items()]
             settings = base.logs[0].pair.settings.search
             plainer = effect.name == HYSTERESIS or (is_simulated(base.logs) and effect.name == LOW_PASSES[0])
             slack = settings.clearly_better * (-1.0 if plainer else 1.0)
             if complete and effect.name != HYSTERESIS:
                 slack *= base.reduced_chi_square
-            trial = fit(base.logs, late, near=base, give_up_above=base.objective + max(0.0, slack))
+            trial = fit(base.logs, tuple(late), near=base, give_up_above=base.objective + max(0.0, slack))
             if bic(trial) >= bic(base) + slack:
                 return base
-            maximum = settings.hysteresis_leaves * (fit(base.logs, late[:-2], near=base).objective - trial.objective)
+            maximum = settings.hysteresis_leaves * (fit(base.logs, others, near=base).objective - trial.objective)
             return base if effect.name == HYSTERESIS and leaves_slow_motion(trial, "accel", maximum) else trial
     return base
 
