@@ -364,12 +364,17 @@ def test_a_late_accelerometer_is_no_hysteresis_and_what_a_delay_leaves_is_no_del
         assert list(both) == ["accel_hysteresis"]
 
 
-def test_a_second_order_filter_of_the_accelerometer_that_shows_its_lag_alone_is_that_lag() -> None:
-    late_s, logs = 0.003, [planted.weighed(planted.pair(trembling(6.0), {"clock_offset": [-0.003], "gyro_delay": [-0.003]}))]
-    (filtered,) = (one for one in planted.catalogue() if one.key == "second_order_low_pass:accel")
-    found = with_delay_of_accel(fit(logs, ((filtered, np.array([70.0, 0.7])),)), planted.catalogue())
-    both = {effect.name: float(theta[0]) for effect, theta in found.chosen}
-    assert both == {name: pytest.approx(-late_s, abs=2e-4) for name in ("clock_offset", "gyro_delay")}
+@pytest.mark.parametrize("clock_s", [0.0, -0.005])
+def test_a_second_order_filter_of_the_accelerometer_that_shows_its_lag_alone_is_that_lag(clock_s: float) -> None:
+    truth = {"clock_offset": [clock_s - 0.003], "gyro_delay": [-0.003]}
+    logs = [planted.weighed(planted.pair(trembling(6.0), truth))]
+    of = {one.key: one for one in planted.catalogue()}
+    clock = [(of["clock_offset"], np.array([clock_s]))] if clock_s else []
+    wrong = fit(logs, (*clock, (of["second_order_low_pass:accel"], np.array([70.0, 0.7]))))
+    found = with_delay_of_accel(wrong, planted.catalogue())
+    assert {effect.name: theta for effect, theta in found.chosen} == {
+        name: pytest.approx(theta, abs=2e-4) for name, theta in truth.items()
+    }
 
 
 def by_poses(pair: Pair) -> Selection:
