@@ -48,7 +48,7 @@ def with_filter_of_each_sensor(base: Fit, named: Sequence[Effect]) -> Fit:
     trials = list[Fit]()
     for chosen in _with_filters(base, lags, {of.key: of for of in named}, LOW_PASSES[exact]):
         trials.append(fit(logs, chosen, near=base, give_up_above=min(map(form_bic, trials), default=np.inf)))
-    best = with_own_forms(min(trials, key=form_bic, default=base), named)
+    best = with_own_forms(min(filter(is_shown, trials), key=form_bic, default=base), named)
     margin = logs[0].pair.settings.search.clearly_better
     if not exact:
         margin *= max(1.0, base.reduced_chi_square)
@@ -56,7 +56,7 @@ def with_filter_of_each_sensor(base: Fit, named: Sequence[Effect]) -> Fit:
         margin = 0.0  # simpler; and no filter is ahead, but a clock may be
     else:
         margin = max(margin, model_error(logs) * sum(taken(base, k) for k in lags if base.chosen[k][0].name in LOW_PASSES))
-    return best if is_shown(best) and form_bic(best) < form_bic(base) - margin else base
+    return best if form_bic(best) < form_bic(base) - margin else base
 
 
 def _lags_s(base: Fit, lags: Sequence[int]) -> dict[str, float]:
