@@ -138,7 +138,7 @@ def model_error(logs: Sequence[WhitenedLog]) -> float:
 
 
 def with_own_forms(base: Fit, named: Sequence[Effect]) -> Fit:
-    """Fit with the filter of each sensor alone in another form, if better; the other sensor's may have another order."""
+    """Fit with the filters of one sensor alone each in another form, if better (BIC)."""
     best = base
     for sensors in ((sensor,) for sensor in SENSORS):
         places = [k for k, (effect, _) in enumerate(best.chosen) if effect.name in LOW_PASSES and effect.sensors == sensors]
@@ -150,9 +150,10 @@ def with_own_forms(base: Fit, named: Sequence[Effect]) -> Fit:
 
 
 def form_bic(found: Fit) -> float:
-    """BIC in which another order counts as a parameter, and any form but an analog first or second order has to be clear.
+    """BIC with a cost for rare forms of filters.
 
-    A filter far above the motion shows its lag alone, which every form has.
+    Another order counts as a parameter, and any form but an analog first or second order has to be clear. A filter far above
+    the motion shows its lag alone, which every form has.
     """
     filters = [effect for effect, _ in found.chosen if effect.name in LOW_PASSES]
     orders, rare = (
@@ -219,7 +220,10 @@ def _starts(other: Effect, effect: Effect, theta: Theta | None, lag_s: float, ra
 
 
 def cutoff_hz(of: Effect, others: Sequence[float], lag_s: float) -> float:
-    """Cut-off frequency with which a low-pass has a lag; that of the analog one if a filter at a rate has less."""
+    """Cut-off frequency with which a low-pass has a lag.
+
+    It is that of the analog one if a filter at a rate has less.
+    """
 
     def longer_s(log_hz: float) -> float:
         return Design.of(of, np.array([np.exp(log_hz), *others])).lag_s - lag_s
@@ -246,7 +250,10 @@ def taken(found: Fit, k: int) -> float:
 
 
 def is_shown(found: Fit) -> bool:
-    """Whether the logs show all low-passes; a digital one that is slower than the samples would give them twice."""
+    """Whether the logs show all low-passes.
+
+    A digital one that is slower than the samples would give them twice.
+    """
     filters = [entry for entry in found.chosen if entry[0].name in LOW_PASSES]
     designs = [Design.of(*entry) for entry in filters]
     slowest_hz = min((min(design.rate_hz, design.smoothing_hz) for design in designs), default=np.inf)

@@ -1,4 +1,4 @@
-"""Filters of one sensor or of each, together with a clock offset or without one, for other lags."""
+"""Filters of one sensor or of each, with a clock offset or without one, for other lags."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ AHEAD = 0.05  # of a sample period: less is no sensor that looks ahead
 
 
 def with_filter_of_each_sensor(base: Fit, named: Sequence[Effect]) -> Fit:
-    """Fit with a low-pass of one sensor, or of each, in its own form, for other lags, if better (BIC).
+    """Fit with a low-pass of one sensor, or of each, for other lags, if better (BIC).
 
     Chips filter gyro and accelerometer each in its own way. The search finds the larger filter on both sensors, or a clock
     that follows the slower one. What that leaves has many other names: a gyro ahead of it, a clock that wanders, smoothed
