@@ -25,8 +25,8 @@ from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.observability import with_plainer_effects
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.estimation.trial import verdicts
-from imutool.diagnosis.estimation.trial.effect_forms import in_forms
-from imutool.diagnosis.estimation.trial.filter_forms import with_delay_of_accel
+from imutool.diagnosis.estimation.trial.effect_forms import exponential, in_forms
+from imutool.diagnosis.estimation.trial.filter_forms import with_delay_of_accel, with_form_of_low_pass
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.trial.sensor_filters import with_filter_of_each_sensor
 from imutool.diagnosis.estimation.trial.walking_bias import std_of_unseen_walk, with_bias_walk
@@ -889,6 +889,18 @@ def test_a_filter_of_each_sensor_that_shows_its_lag_alone_has_no_order_by_chance
     selection = asked(through(trembling(6.0), of_gyro, of_accel, 0.0), beyond=False)
     assert names(selection) in (["low_pass:accel", "gyro_delay"], ["gyro_delay", "low_pass:accel"])
     assert sure(selection, "gyro_delay", [2.0 * 0.7 / (2.0 * np.pi * 40.0)])
+
+
+def test_a_digital_filter_whose_rate_stood_for_a_scale_is_analog_again() -> None:
+    """Next to the scale its rate had no size, so that neither of them was a finding."""
+    truth = {"second_order_low_pass": [20.0, 0.7], "gyro_scale": [0.02, -0.015, 0.01]}
+    logs, of = [planted.weighed(planted.pair(trembling(6.0), truth))], {one.key: one for one in planted.catalogue()}
+    smoothing = exponential(of["second_order_low_pass"]), np.array([16.0, 0.66, 558.0])
+    wrong = fit(logs, (smoothing, (of["gyro_scale"], np.zeros(3))))
+    found = with_form_of_low_pass(wrong, planted.catalogue())
+    assert {effect.key: theta for effect, theta in found.chosen} == {
+        key: pytest.approx(theta, rel=0.05) for key, theta in truth.items()
+    }
 
 
 def test_two_exponential_filters_in_a_row_are_one_low_pass_and_no_clock() -> None:

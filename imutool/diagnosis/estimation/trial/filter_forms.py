@@ -68,8 +68,14 @@ def with_form_of_low_pass(base: Fit, named: Sequence[Effect]) -> Fit:
     if not is_simulated(logs := base.logs):
         return base
     settings, error = logs[0].pair.settings.search, model_error(logs)
-    for k, (effect, _) in enumerate(base.chosen):
-        if effect.name not in LOW_PASSES or {RATE, SMOOTHING} & {*effect.parameters}:
+    for k, (effect, theta) in enumerate(base.chosen):
+        if effect.name not in LOW_PASSES:
+            continue
+        if {RATE, SMOOTHING} & {*effect.parameters}:  # an effect that came in since may explain what its rate did
+            others, analog = (*base.chosen[:k], *base.chosen[k + 1 :]), [of for of in named if of.key == effect.key]
+            trial = min((fit(logs, (*others, (of, theta[:-1])), near=base) for of in analog), key=form_bic, default=base)
+            if form_bic(trial) < form_bic(base):
+                return with_form_of_low_pass(trial, named)
             continue
         errs, best = error * taken(base, k), base
         for chosen in _forms(base, k, _allowed(base, k, named)):
