@@ -29,17 +29,15 @@ from imutool.diagnosis.estimation.observability import (
 )
 from imutool.diagnosis.estimation.significance import bic, gain_for, unnamed_count
 from imutool.diagnosis.estimation.trial.filter_forms import (
-    LAGS,
     beside_offset,
     with_delay_of_accel,
-    with_filter_of_each_sensor,
     with_form_of_low_pass,
     with_form_of_resonance,
     without_unseen_low_pass,
 )
-from imutool.diagnosis.estimation.trial.filters_by_poses import LAGS_BY_POSES, with_filters_by_poses
 from imutool.diagnosis.estimation.trial.model_error import LowPassError
 from imutool.diagnosis.estimation.trial.selection import Selection
+from imutool.diagnosis.estimation.trial.sensor_filters import LAGS_BY_POSES, with_filter_of_each_sensor
 from imutool.diagnosis.estimation.trial.verdicts import Trial
 from imutool.diagnosis.estimation.unnamed_effects import smoothing, with_finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
@@ -109,10 +107,8 @@ def _grown(first: _Search, base: Fit, unnamed: Sequence[Effect], later: Sequence
             if better.chosen[-1][0].name in LOW_PASSES:
                 better = with_form_of_low_pass(better, search.named)
                 better = with_delay_of_accel(better, search.named)
-            if better.chosen[-1][0].name in LAGS:
-                better = with_filter_of_each_sensor(better, search.named)
             if better.chosen[-1][0].name in LAGS_BY_POSES:
-                better = with_filters_by_poses(better, search.named)
+                better = with_filter_of_each_sensor(better, search.named)
             better = with_form_of_resonance(better, search.named)
             before, base = base.objective, search.pruned(search.exchanged(search.with_always(better)))
         elif waiting:

@@ -25,9 +25,10 @@ from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.observability import with_plainer_effects
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.estimation.trial import verdicts
-from imutool.diagnosis.estimation.trial.effect_forms import in_forms
-from imutool.diagnosis.estimation.trial.filter_forms import with_delay_of_accel, with_filter_of_each_sensor
+from imutool.diagnosis.estimation.trial.effect_forms import exponential, in_forms
+from imutool.diagnosis.estimation.trial.filter_forms import with_delay_of_accel, with_form_of_low_pass
 from imutool.diagnosis.estimation.trial.selection import Selection
+from imutool.diagnosis.estimation.trial.sensor_filters import with_filter_of_each_sensor
 from imutool.diagnosis.estimation.trial.walking_bias import std_of_unseen_walk, with_bias_walk
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked
@@ -363,12 +364,17 @@ def test_a_late_accelerometer_is_no_hysteresis_and_what_a_delay_leaves_is_no_del
         assert list(both) == ["accel_hysteresis"]
 
 
-def test_a_second_order_filter_of_the_accelerometer_that_shows_its_lag_alone_is_that_lag() -> None:
-    late_s, logs = 0.003, [planted.weighed(planted.pair(trembling(6.0), {"clock_offset": [-0.003], "gyro_delay": [-0.003]}))]
-    (filtered,) = (one for one in planted.catalogue() if one.key == "second_order_low_pass:accel")
-    found = with_delay_of_accel(fit(logs, ((filtered, np.array([70.0, 0.7])),)), planted.catalogue())
-    both = {effect.name: float(theta[0]) for effect, theta in found.chosen}
-    assert both == {name: pytest.approx(-late_s, abs=2e-4) for name in ("clock_offset", "gyro_delay")}
+@pytest.mark.parametrize("clock_s", [0.0, -0.005])
+def test_a_second_order_filter_of_the_accelerometer_that_shows_its_lag_alone_is_that_lag(clock_s: float) -> None:
+    truth = {"clock_offset": [clock_s - 0.003], "gyro_delay": [-0.003]}
+    logs = [planted.weighed(planted.pair(trembling(6.0), truth))]
+    of = {one.key: one for one in planted.catalogue()}
+    clock = [(of["clock_offset"], np.array([clock_s]))] if clock_s else []
+    wrong = fit(logs, (*clock, (of["second_order_low_pass:accel"], np.array([70.0, 0.7]))))
+    found = with_delay_of_accel(wrong, planted.catalogue())
+    assert {effect.name: theta for effect, theta in found.chosen} == {
+        name: pytest.approx(theta, abs=2e-4) for name, theta in truth.items()
+    }
 
 
 def by_poses(pair: Pair) -> Selection:
@@ -883,6 +889,18 @@ def test_a_filter_of_each_sensor_that_shows_its_lag_alone_has_no_order_by_chance
     selection = asked(through(trembling(6.0), of_gyro, of_accel, 0.0), beyond=False)
     assert names(selection) in (["low_pass:accel", "gyro_delay"], ["gyro_delay", "low_pass:accel"])
     assert sure(selection, "gyro_delay", [2.0 * 0.7 / (2.0 * np.pi * 40.0)])
+
+
+def test_a_digital_filter_whose_rate_stood_for_a_scale_is_analog_again() -> None:
+    """Next to the scale its rate had no size, so that neither of them was a finding."""
+    truth = {"second_order_low_pass": [20.0, 0.7], "gyro_scale": [0.02, -0.015, 0.01]}
+    logs, of = [planted.weighed(planted.pair(trembling(6.0), truth))], {one.key: one for one in planted.catalogue()}
+    smoothing = exponential(of["second_order_low_pass"]), np.array([16.0, 0.66, 558.0])
+    wrong = fit(logs, (smoothing, (of["gyro_scale"], np.zeros(3))))
+    found = with_form_of_low_pass(wrong, planted.catalogue())
+    assert {effect.key: theta for effect, theta in found.chosen} == {
+        key: pytest.approx(theta, rel=0.05) for key, theta in truth.items()
+    }
 
 
 def test_two_exponential_filters_in_a_row_are_one_low_pass_and_no_clock() -> None:

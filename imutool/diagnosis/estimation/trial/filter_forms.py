@@ -20,10 +20,7 @@ from imutool.sensor.effects.low_pass import RATE, SMOOTHING, Design
 from imutool.sensor.effects.second_order_low_pass import BUTTERWORTH
 from imutool.units import SENSORS
 
-LAGS = (*LOW_PASSES, "clock_offset", "gyro_delay")
 HYSTERESIS = "accel_hysteresis"
-MIN_LAG = 0.05  # of a sample period: less is no filter that a log shows
-CLOCKS_SHARE = 0.5  # of the lag that both sensors have, from where the fit of a clock together with filters starts
 TAKEN_BACK = 0.5  # of a low-pass's lag: a clock that leaves less takes it back
 SLOWEST = 0.9  # samples of a digital filter for one that is recorded
 
@@ -68,27 +65,30 @@ def with_form_of_low_pass(base: Fit, named: Sequence[Effect]) -> Fit:
     of another form would leave its error to other effects. Poses do not know so fast a motion. Where the simulation itself errs
     (its noise was filtered, it folds vibrations), a filter of other sensors has to explain more than that.
     """
-    if not _is_simulated(logs := base.logs):
+    if not is_simulated(logs := base.logs):
         return base
-    settings, period_s = logs[0].pair.settings.search, logs[0].pair.period_s
-    error = _model_error(logs)
-    for k, (effect, _) in enumerate(base.chosen):
-        if effect.name not in LOW_PASSES or {RATE, SMOOTHING} & {*effect.parameters}:
+    settings, error = logs[0].pair.settings.search, model_error(logs)
+    for k, (effect, theta) in enumerate(base.chosen):
+        if effect.name not in LOW_PASSES:
             continue
-        errs, best = error * _taken(base, k), base
-        for chosen in _forms(base, k, _allowed(base, k, named), 1.0 / period_s):
+        if {RATE, SMOOTHING} & {*effect.parameters}:  # an effect that came in since may explain what its rate did
+            others, analog = (*base.chosen[:k], *base.chosen[k + 1 :]), [of for of in named if of.key == effect.key]
+            trial = min((fit(logs, (*others, (of, theta[:-1])), near=base) for of in analog), key=form_bic, default=base)
+            if form_bic(trial) < form_bic(base):
+                return with_form_of_low_pass(trial, named)
+            continue
+        errs, best = error * taken(base, k), base
+        for chosen in _forms(base, k, _allowed(base, k, named)):
             margin = max(settings.clearly_better, 0.0 if _sensors(chosen) == _sensors(base.chosen) else errs)
             trial = fit(logs, chosen, near=base, give_up_above=bic(best) - margin)
-            if _form_bic(trial) < _form_bic(best) and bic(trial) < bic(base) - margin and not _folds(trial, period_s):
+            if form_bic(trial) < form_bic(best) and bic(trial) < bic(base) - margin and is_shown(trial):
                 best = trial
         if best is not base:
             return with_form_of_low_pass(best, named)
         two = _of_each_sensor(base, k, named)
         trial = fit(logs, two, near=base) if two else base
         if bic(trial) < bic(base) - settings.model_error_low_pass / error * max(settings.clearly_better, errs):
-            for sensor in SENSORS:  # a second order that only fits with an endless damping is a first one
-                trial = _with_own_form(trial, (sensor,), named)
-            return with_form_of_low_pass(trial, named)
+            return with_form_of_low_pass(with_own_forms(trial, named), named)  # endless damping is of first order
     return base
 
 
@@ -112,94 +112,54 @@ def with_delay_of_accel(base: Fit, named: Sequence[Effect], *, complete: bool = 
     that the search finds the low-pass of this lag, or of slow motion a hysteresis. A hysteresis, and against a
     simulation a first order, has one number, and stays unless it is clearly worse. What a `complete` fit leaves is noise.
     """
-    both = [of for key in ("clock_offset", "gyro_delay") for of in named if of.key == key and key not in base.keys]
+    both = {key: of for key in ("clock_offset", "gyro_delay") for of in named if of.key == key}
+    now = {effect.key: theta for effect, theta in base.chosen}
     for k, (effect, theta) in enumerate(base.chosen):
         if len(both) == 2 and effect.name in (*LOW_PASSES, HYSTERESIS) and effect.sensors == ("accel",):
-            start = np.array([0.0 if effect.name == HYSTERESIS else -Design.of(effect, theta).lag_s])
-            late = (*base.chosen[:k], *base.chosen[k + 1 :], *((of, start) for of in both))
+            others, lag_s = (*base.chosen[:k], *base.chosen[k + 1 :]), sensor_lag_s(effect, theta, "accel")
+            late = [entry for entry in others if entry[0].key not in both]
+            late += [(of, now.get(key, np.zeros(1)) - lag_s) for key, of in both.items()]
             settings = base.logs[0].pair.settings.search
-            plainer = effect.name == HYSTERESIS or (_is_simulated(base.logs) and effect.name == LOW_PASSES[0])
+            plainer = effect.name == HYSTERESIS or (is_simulated(base.logs) and effect.name == LOW_PASSES[0])
             slack = settings.clearly_better * (-1.0 if plainer else 1.0)
             if complete and effect.name != HYSTERESIS:
                 slack *= base.reduced_chi_square
-            trial = fit(base.logs, late, near=base, give_up_above=base.objective + max(0.0, slack))
+            trial = fit(base.logs, tuple(late), near=base, give_up_above=base.objective + max(0.0, slack))
             if bic(trial) >= bic(base) + slack:
                 return base
-            maximum = settings.hysteresis_leaves * (fit(base.logs, late[:-2], near=base).objective - trial.objective)
+            maximum = settings.hysteresis_leaves * (fit(base.logs, others, near=base).objective - trial.objective)
             return base if effect.name == HYSTERESIS and leaves_slow_motion(trial, "accel", maximum) else trial
     return base
 
 
-def with_filter_of_each_sensor(base: Fit, named: Sequence[Effect]) -> Fit:
-    """Fit with a low-pass of each sensor for lags of both, in its own form, if better (BIC).
-
-    Chips filter gyro and accelerometer each in its own way. The search finds the larger filter on both sensors, and then a
-    clock, or a gyro, that takes some of the lag back.
-    """
-    if not _is_simulated(logs := base.logs):
-        return base
-    lags = [k for k, (effect, _) in enumerate(base.chosen) if effect.name in LAGS]
-    if not {base.chosen[k][0].name for k in lags} - {"clock_offset"} or (
-        len(lags) == 1 and base.chosen[lags[0]][0].name in LOW_PASSES
-    ):
-        return base
-    others, period_s = tuple(entry for k, entry in enumerate(base.chosen) if k not in lags), logs[0].pair.period_s
-    lag_s: dict[tuple[str, ...], float] = {
-        (sensor,): sum(sensor_lag_s(*base.chosen[k], sensor) for k in lags) for sensor in SENSORS
-    }
-    clocks, early_s = [of for of in named if of.name == "clock_offset"], min(0.0, *lag_s.values())
-    early_s = early_s if early_s < -MIN_LAG * period_s else 0.0  # no filter is ahead, but a clock may be
-    late = [sensors for sensors, own_s in lag_s.items() if own_s - early_s > MIN_LAG * period_s]
-    second = [of for of in named if of.name == LOW_PASSES[1] and of.sensors in late]
-    if not second or (early_s and not clocks):
-        return base
-
-    def beside(shared_s: float, *clock: tuple[Effect, Theta]) -> Fit:
-        each = ((of, np.array([_cutoff_hz(of, [BUTTERWORTH], lag_s[of.sensors] - shared_s), BUTTERWORTH])) for of in second)
-        return fit(logs, (*others, *clock, *each), near=base)
-
-    best = beside(early_s, *((of, np.array([-early_s])) for of in clocks if early_s))
-    for of in second:
-        best = _with_own_form(best, of.sensors, named)
-    if early_s:  # with a filter in its place neither answer is the plainer one
-        slack = logs[0].pair.settings.search.clearly_better if len(lags) > 1 else 0.0
-        return best if _form_bic(best) < _form_bic(base) + slack else base
-    shared_s = CLOCKS_SHARE * min(lag_s.values())  # of the lag of both may be the clock's
-    offsets = [beside(shared_s, (of, np.array([-shared_s]))) for of in clocks if len(second) > 1]
-    best = min((best, *offsets), key=_form_bic)
-    if len(best.prior) < len(base.prior):  # simpler
-        return best if _form_bic(best) < _form_bic(base) else base
-    margin = logs[0].pair.settings.search.clearly_better
-    errs = _model_error(logs) * sum(_taken(base, k) for k in lags if base.chosen[k][0].name in LOW_PASSES)
-    return best if _form_bic(best) < _form_bic(base) - max(margin, errs) else base
-
-
-def _is_simulated(logs: Sequence[WhitenedLog]) -> bool:
+def is_simulated(logs: Sequence[WhitenedLog]) -> bool:
     """Whether all logs are of an IMU and compared with a simulation."""
     return all(isinstance(log.pair, Pair) and log.pair.exact for log in logs)
 
 
-def _model_error(logs: Sequence[WhitenedLog]) -> float:
+def model_error(logs: Sequence[WhitenedLog]) -> float:
     """Share of the squares of a filter by which its model may err, against a simulation."""
     settings = logs[0].pair.settings.search
     return settings.model_error_denoised if any(log.pair.denoised for log in logs) else settings.model_error
 
 
-def _with_own_form(base: Fit, sensors: tuple[str, ...], named: Sequence[Effect]) -> Fit:
-    """Fit with the filter of one sensor in another form, if better."""
-    k = next(k for k, (effect, _) in enumerate(base.chosen) if effect.name in LOW_PASSES and effect.sensors == sensors)
-    period_s, best = base.logs[0].pair.period_s, base
-    forms = [of for of in named if of.name in LOW_PASSES and of.sensors == sensors]  # the other sensor may have another order
-    for chosen in _forms(base, k, forms, 1.0 / period_s):
-        trial = fit(base.logs, chosen, near=base, give_up_above=bic(best))
-        best = trial if _form_bic(trial) < _form_bic(best) and not _folds(trial, period_s) else best
+def with_own_forms(base: Fit, named: Sequence[Effect]) -> Fit:
+    """Fit with the filters of one sensor alone each in another form, if better (BIC)."""
+    best = base
+    for sensors in ((sensor,) for sensor in SENSORS):
+        places = [k for k, (effect, _) in enumerate(best.chosen) if effect.name in LOW_PASSES and effect.sensors == sensors]
+        forms = [of for of in named if of.name in LOW_PASSES and of.sensors == sensors]
+        for chosen in [chosen for k in places for chosen in _forms(best, k, forms)]:
+            trial = fit(base.logs, chosen, near=best, give_up_above=bic(best))
+            best = trial if form_bic(trial) < form_bic(best) and is_shown(trial) else best
     return best
 
 
-def _form_bic(found: Fit) -> float:
-    """BIC in which another order counts as a parameter, and any form but an analog first or second order has to be clear.
+def form_bic(found: Fit) -> float:
+    """BIC with a cost for rare forms of filters.
 
-    A filter far above the motion shows its lag alone, which every form has.
+    Another order counts as a parameter, and any form but an analog first or second order has to be clear. A filter far above
+    the motion shows its lag alone, which every form has.
     """
     filters = [effect for effect, _ in found.chosen if effect.name in LOW_PASSES]
     orders, rare = (
@@ -236,8 +196,9 @@ def _allowed(base: Fit, k: int, named: Sequence[Effect]) -> list[Effect]:
     return [of for of in named if of.name not in LOW_PASSES or not any(exclude_each_other(of, e) for e, _ in others)]
 
 
-def _forms(base: Fit, k: int, named: Sequence[Effect], rate_hz: float) -> Iterator[Chosen]:
+def _forms(base: Fit, k: int, named: Sequence[Effect]) -> Iterator[Chosen]:
     """Effects with another form of a low-pass; a clock offset may share its lag."""
+    rate_hz = 1.0 / base.logs[0].pair.period_s if is_simulated(base.logs) else np.inf  # too fast for poses
     (effect, theta), others = base.chosen[k], (*base.chosen[:k], *base.chosen[k + 1 :])
     offset = next((e for e in named if e.name == "clock_offset"), None)
     lag_s, forms = Design.of(effect, theta).lag_s, [of for of in named if of.name in LOW_PASSES]
@@ -257,15 +218,18 @@ def _forms(base: Fit, k: int, named: Sequence[Effect], rate_hz: float) -> Iterat
 def _starts(other: Effect, effect: Effect, theta: Theta | None, lag_s: float, rate_hz: float) -> list[tuple[Effect, Theta]]:
     """A low-pass with a lag: analog if it is another one than the fitted, digital, and as smoothing."""
     damping = [BUTTERWORTH][: len(other.parameters) - 1]
-    at_rate = [digital(other), *([] if other.constants else [exponential(other)])]
-    starts = [(of, np.array([_cutoff_hz(of, [*damping, rate_hz], lag_s), *damping, rate_hz])) for of in at_rate]
+    at_rate = [digital(other), *([] if other.constants else [exponential(other)])] if np.isfinite(rate_hz) else []
+    starts = [(of, np.array([cutoff_hz(of, [*damping, rate_hz], lag_s), *damping, rate_hz])) for of in at_rate]
     if theta is not None and other.key == effect.key:
         return starts
-    return [(other, np.array([_cutoff_hz(other, damping, lag_s), *damping])), *starts]
+    return [(other, np.array([cutoff_hz(other, damping, lag_s), *damping])), *starts]
 
 
-def _cutoff_hz(of: Effect, others: Sequence[float], lag_s: float) -> float:
-    """Cut-off frequency with which a low-pass has a lag; that of the analog one if a filter at a rate has less."""
+def cutoff_hz(of: Effect, others: Sequence[float], lag_s: float) -> float:
+    """Cut-off frequency with which a low-pass has a lag.
+
+    It is that of the analog one if a filter at a rate has less.
+    """
 
     def longer_s(log_hz: float) -> float:
         return Design.of(of, np.array([np.exp(log_hz), *others])).lag_s - lag_s
@@ -282,7 +246,7 @@ def _of_each_sensor(base: Fit, k: int, named: Sequence[Effect]) -> Chosen:
     return (*base.chosen[:k], *each, *base.chosen[k + 1 :]) if each and not effect.constants else ()
 
 
-def _taken(found: Fit, k: int) -> float:
+def taken(found: Fit, k: int) -> float:
     """White squares of what an effect changes."""
     others, total = (*found.chosen[:k], *found.chosen[k + 1 :]), 0.0
     for log in found.logs:
@@ -291,8 +255,13 @@ def _taken(found: Fit, k: int) -> float:
     return total
 
 
-def _folds(found: Fit, period_s: float) -> bool:
-    """Whether a digital filter is slower than the samples, which it would give twice."""
-    designs = [Design.of(effect, theta) for effect, theta in found.chosen if effect.name in LOW_PASSES]
+def is_shown(found: Fit) -> bool:
+    """Whether the logs show all low-passes.
+
+    A digital one that is slower than the samples would give them twice.
+    """
+    filters = [entry for entry in found.chosen if entry[0].name in LOW_PASSES]
+    designs = [Design.of(*entry) for entry in filters]
     slowest_hz = min((min(design.rate_hz, design.smoothing_hz) for design in designs), default=np.inf)
-    return slowest_hz * period_s < SLOWEST
+    folds = slowest_hz * found.logs[0].pair.period_s < SLOWEST
+    return not folds and not any(beyond_the_band(*entry, found.logs) for entry in filters)
