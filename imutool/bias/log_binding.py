@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -73,6 +73,14 @@ def other_conditions(model: BiasModel, samples: tuple[Float64[np.ndarray, " n"],
     if model.rate_hz and not (1.0 - MAX_RATE) / longest < model.rate_hz < (1.0 + MAX_RATE) / shortest:
         sentences.append(f"samples at {1.0 / period_s:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
     return sentences
+
+
+def other_unit(model: BiasModel, about: Mapping[str, str]) -> Iterator[str]:
+    """Sentences on a log that names another origin than the model's."""
+    for key, words in (("sensor", "sensor"), ("dataset", "data set")):
+        own, other = model.card.get(key), about.get(key)
+        if own and other and own != other:
+            yield f"the model was made for the {words} {own}, the log is of {other}"
 
 
 class TemperatureDrift:

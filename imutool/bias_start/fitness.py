@@ -18,14 +18,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
 
 from imutool.bias import static
 from imutool.bias.hybrid import without_lever_arm
-from imutool.bias.log_binding import other_conditions
+from imutool.bias.log_binding import other_conditions, other_unit
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias.model_file import library, shipped_for
 from imutool.bias_start import Fitness
@@ -48,19 +48,23 @@ from imutool.bias_start.prior_width import (
     BiasPrior,
     contradicted_start,
     max_left,
+    other_bias,
     supported_std,
     turned_axes,
     untold_bias,
 )
-from imutool.bias_start.stretches import GRAVITY_RANGE, unusual_gravity
-from imutool.inertial.innovations import SURPRISING, Innovations, Share, innovations, share_of_correction
-from imutool.recording import GRAVITY_M_S2
+from imutool.bias_start.stretches import unusual_gravity
+from imutool.inertial.innovations import SURPRISING, Share, innovations, share_of_correction
 
 CHECKED_S = 120.0  # of a log that the check reads
 MIN_SPEED_M_S, MIN_PIVOT_M = 1.0, 1e-3  # of the filter: an arm and a tight bound would take up what a wrong scale leaves
 MAX_OF_GUESS = np.array([3.0] * 3 + [MAX_DEVIATIONS] * 3)  # the same where few sessions leave the prior's width to a guess
 MIN_EVIDENCE = -40.0  # log-likelihood of the model against none
 DEPENDENT = 2.0  # ratio of the shown bias's deviation to the filter's, which takes velocities for independent; a hand circles
+ROOM_M = 8.0  # deviation of a position every half second; three metres that last some seconds are the same
+MAX_IN_ROOM = 0.45  # mean chi-square of three: 0.4 or less in rooms and halls, from 4 on in vehicles; walkers lie between
+MAX_STD, OF_FILTER = 0.5, 0.5  # deviation by the filter that shows a share; part of it beside Newey and West's
+SURE_GYRO = {"gyro_density": 2e-4, "gyro_scale": 1e-4}  # rad/s/sqrt(Hz): its errors are in question, so they are no noise
 HALF, MAX_SHARE = 0.5, 1.5  # of a correction: between them it does more good than harm
 MIN_SHARE = -2.0  # below, the log lacks so much else that the correction makes it worse by less than half
 MIN_SHOWN = 0.005  # deviation of a share that a percentage shows
@@ -80,7 +84,6 @@ class _Evidence:
     difference: Vector6
     variance: Vector6
     stops: tuple[tuple[float, float], ...] = ()
-    innovations: Innovations = field(default_factory=lambda: Innovations(np.zeros((0, 3)), np.zeros((0, 3, 3))))
 
 
 def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], about: Mapping[str, str]) -> Fitness:
@@ -89,7 +92,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     `about` is what the log says of its origin: `sensor`, `dataset`.
     """
     samples = head(batches)
-    if len(samples[0]) and (wrong := _wrong_gravity(samples, start)):
+    if len(samples[0]) and (wrong := unusual_gravity(samples[2], start.rest[3:])):
         return Fitness("unfit", (wrong,))
     if model.method == static.Model.method:
         return _untrained(start, samples)
@@ -109,33 +112,33 @@ def _trained(model: BiasModel, start: InitialBias, samples: Samples, about: Mapp
     unknown = replace(prior, mean=np.where(np.abs(prior.mean) > UNKNOWN_STD, prior.mean, 0.0), std=UNKNOWN_STD, minimum=None)
     corrected, of_sensor = (_without_motion(each, samples, prior) for each in (model, without_lever_arm(model)))
     at_poses = (*samples[:2], samples[2] + corrected[2] - of_sensor[2])  # a lever arm is no error of the sensor
-    found, none, unstarted = _evidence((corrected, at_poses, corrected), (prior, unknown, unknown))
+    found, none = _evidence((corrected, at_poses), (prior, unknown))
     shown_std = np.sqrt(DEPENDENT**2 * found.variance + AT_REST_STD**2)
     other_start, harmful = contradicted_start(start.rest, start.std, prior.mean + found.difference, shown_std)
     supported = supported_std(prior.std, prior.minimum, found.difference, DEPENDENT**2 * found.variance)
     prior = replace(prior, std=np.minimum(supported, prior.std))  # a contradiction widens nothing here
     maximum = np.full(6, MAX_DEVIATIONS) if prior.minimum is None else MAX_OF_GUESS
-    share = share_of_correction(none.innovations, unstarted.innovations)
+    share = _share((at_poses, corrected), unknown)
     confirmed = HALF < share.value - SURE * share.std < MAX_SHARE
     max_share = max_left(len(model.card.get("sessions", ())))
     other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean, max_share, confirmed=confirmed)
-    other_bias, refuted = list(_other_bias(found, prior, maximum)), list(_refuted(share))
-    contradictions = [*other_axes, *other_bias, *_disagreement(found, none), *refuted]
+    new_bias, refuted = list(other_bias(found.difference, _deviations(found, prior), maximum)), list(_refuted(share))
+    contradictions = [*other_axes, *new_bias, *_disagreement(found, none), *refuted]
     if harmful or contradictions:
         used = _started(start, prior)
         same = np.array_equal(used.mean, prior.mean)
         worse = _worse_than_none(corrected if same else _without_motion(model, samples, used), used, found, prior, none)
         opposite = bool(refuted) and share.value < -SURE * share.std
-        if harmful or other_axes or worse or opposite or (other_bias and refuted):
+        if harmful or other_axes or worse or opposite or (new_bias and refuted):
             return Fitness("unfit", (*other_start, *contradictions, *worse))
     doubts = [
         *other_start,
-        *(sentence for sentence in contradictions if not confirmed or sentence not in other_bias),
+        *(sentence for sentence in contradictions if not confirmed or sentence not in new_bias),
         *changed_at_rest(corrected, found.stops, prior),
         *_not_shown(start, found),
         *model.remarks,
         *other_conditions(model, samples),
-        *_other_unit(model, about),
+        *other_unit(model, about),
     ]
     if not (doubts or confirmed or _same_unit(model, about)) and (doubt := untold_bias(prior.mean, _shown_std(found, prior))):
         doubts.append(doubt)
@@ -145,7 +148,7 @@ def _trained(model: BiasModel, start: InitialBias, samples: Samples, about: Mapp
     followed = [] if model.log_drift is None else [f"its bias follows {model.log_drift.name}"]
     if model.load_before is not None:
         followed.append("the sensor was in use before the log, so its drift does not start cold")
-    return Fitness("fits", (agreement, *other_bias, *followed))
+    return Fitness("fits", (agreement, *new_bias, *followed))
 
 
 def _untrained(start: InitialBias, samples: Samples) -> Fitness:
@@ -169,13 +172,6 @@ def head(batches: Iterable[Samples]) -> Samples:
     return t_s[:end], gyro[:end], accel[:end]
 
 
-def _wrong_gravity(samples: Samples, start: InitialBias) -> str:
-    """Sentence on a specific force that is not gravity's in the median or at rest; empty if it is."""
-    bias = float(np.linalg.norm(start.rest[3:]))
-    without = f"the accelerometer would have a bias of {bias:.3g} m/s²: it does not measure gravity, or its unit is not m/s²"
-    return unusual_gravity(samples[2]) or (without if bias > (1.0 - GRAVITY_RANGE[0]) * GRAVITY_M_S2 else "")
-
-
 def _without_motion(model: BiasModel, samples: Samples, prior: BiasPrior) -> Samples:
     """Samples minus the model's motion-dependent bias."""
     t_s, gyro, accel = samples
@@ -191,10 +187,31 @@ def _started(start: InitialBias, prior: BiasPrior) -> BiasPrior:
 
 def _evidence(samples: Sequence[Samples], priors: Sequence[BiasPrior]) -> list[_Evidence]:
     """Evidence of samples at the same times, which hold no motion-dependent bias, each about its prior of a constant bias."""
+    return [_shown(*each) for each in zip(_filtered(samples, priors), priors, strict=True)]
+
+
+def _filtered(samples: Sequence[Samples], priors: Sequence[BiasPrior], **changes: float) -> list[list[FilteredBlock]]:
+    """Filtered blocks of samples at the same times, by settings that take up little of what a wrong scale leaves."""
     settings = priors[0].settings  # all are of one model
-    careful = msgspec.structs.replace(settings, speed_m_s=max(settings.speed_m_s, MIN_SPEED_M_S), pivot_m=MIN_PIVOT_M)
-    filters = [BiasFilter(replace(prior, walk=np.zeros(6)), careful, ahead=True) for prior in priors]
-    return [_shown(blocks, prior) for blocks, prior in zip(filter_together(filters, samples), priors, strict=True)]
+    speed_m_s = max(settings.speed_m_s, MIN_SPEED_M_S)
+    careful = msgspec.structs.replace(settings, speed_m_s=speed_m_s, pivot_m=MIN_PIVOT_M, **changes)
+    return filter_together([BiasFilter(replace(prior, walk=np.zeros(6)), careful, ahead=True) for prior in priors], samples)
+
+
+def _share(samples: Sequence[Samples], unknown: BiasPrior) -> Share:
+    """Share of a correction that a log shows, from samples without it and with it and a prior of an unknown bias."""
+    if all(np.array_equal(*columns) for columns in zip(*samples, strict=True)):
+        return Share(0.0, math.inf, math.inf)
+    in_room = _filtered(samples, [unknown] * 2, room_m=ROOM_M, **SURE_GYRO)
+    away = [innovations(block.step for block in blocks if not block.resting).chi_square for blocks in in_room]
+    share = _share_of(in_room)
+    stays = any(each.sum() <= MAX_IN_ROOM * len(each) for each in away)
+    return share if stays and share.filter_std < MAX_STD else _share_of(_filtered(samples, [unknown] * 2))
+
+
+def _share_of(runs: Sequence[Sequence[FilteredBlock]]) -> Share:
+    share = share_of_correction(*(innovations(block.step for block in blocks) for blocks in runs))
+    return share._replace(std=math.hypot(share.std, OF_FILTER * share.filter_std))
 
 
 def _shown(blocks: Sequence[FilteredBlock], prior: BiasPrior) -> _Evidence:
@@ -209,7 +226,7 @@ def _shown(blocks: Sequence[FilteredBlock], prior: BiasPrior) -> _Evidence:
     difference = np.where(shown, (last.bias - prior.mean) / gain, 0.0)
     variance = np.where(shown, 1.0 / np.where(shown, precision, 1.0), np.inf) + prior.walk**2 * blocks[-1].end_s
     surprising = float((found.chi_square > SURPRISING).mean())
-    return _Evidence(float(found.log_likelihood.sum()), surprising, difference, variance, stops_of(blocks), found)
+    return _Evidence(float(found.log_likelihood.sum()), surprising, difference, variance, stops_of(blocks))
 
 
 def _not_shown(start: InitialBias, found: _Evidence) -> Iterator[str]:
@@ -231,18 +248,6 @@ def _deviations(found: _Evidence, prior: BiasPrior) -> Vector6:
 def _shown_std(found: _Evidence, prior: BiasPrior) -> Vector6:
     """Standard deviation of the bias that a log shows about the prior's mean."""
     return np.asarray(np.sqrt(prior.std**2 + DEPENDENT**2 * found.variance + AT_REST_STD**2))
-
-
-def _other_bias(found: _Evidence, prior: BiasPrior, maximum: Vector6) -> Iterator[str]:
-    """Sentences on biases that are not those of a prior."""
-    deviations = _deviations(found, prior)
-    for sensor, unit, columns in (("gyro", "rad/s", slice(0, 3)), ("accelerometer", "m/s²", slice(3, 6))):
-        axis = int(np.argmax(deviations[columns])) + columns.start
-        if deviations[axis] > maximum[axis]:
-            yield (
-                f"the {sensor}'s bias about {'xyz'[axis % 3]} differs by {found.difference[axis]:+.2g} {unit} from the model's"
-                f" prior, {deviations[axis]:.0f} standard deviations: another unit, or another turn-on"
-            )
 
 
 def _disagreement(found: _Evidence, none: _Evidence) -> Iterator[str]:
@@ -273,14 +278,6 @@ def _worse_than_none(samples: Samples, used: BiasPrior, found: _Evidence, prior:
     if evidence > MIN_EVIDENCE:
         return []
     return [f"the raw samples agree with gravity and stops better than the corrected, by {-evidence:.0f} in log-likelihood"]
-
-
-def _other_unit(model: BiasModel, about: Mapping[str, str]) -> Iterator[str]:
-    """Sentences on a log that names another origin than the model's."""
-    for key, words in (("sensor", "sensor"), ("dataset", "data set")):
-        own, other = model.card.get(key), about.get(key)
-        if own and other and own != other:
-            yield f"the model was made for the {words} {own}, the log is of {other}"
 
 
 def _same_unit(model: BiasModel, about: Mapping[str, str]) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -139,6 +139,17 @@ def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, max_left: floa
     return [
         f"its bias is that of the training logs if its x, y, z are their {axis_names(rotations[best])}: the axes are turned"
     ]
+
+
+def other_bias(difference: Vector6, deviations: Vector6, maximum: Vector6) -> Iterator[str]:
+    """Sentences on biases that differ from a prior's by more deviations than a maximum."""
+    for sensor, unit, columns in (("gyro", "rad/s", slice(0, 3)), ("accelerometer", "m/s²", slice(3, 6))):
+        axis = int(np.argmax(deviations[columns])) + columns.start
+        if deviations[axis] > maximum[axis]:
+            yield (
+                f"the {sensor}'s bias about {'xyz'[axis % 3]} differs by {difference[axis]:+.2g} {unit} from the model's"
+                f" prior, {deviations[axis]:.0f} standard deviations: another unit, or another turn-on"
+            )
 
 
 def contradicted_start(rest: Vector6, std: Vector6, shown: Vector6, shown_std: Vector6) -> tuple[list[str], bool]:

@@ -55,13 +55,14 @@ class Stretch(NamedTuple):
         return not 0.0 < self.step_s <= MAX_GAP_S
 
 
-def unusual_gravity(accel: Rows3) -> str:
-    """Sentence on a specific force whose median is far from gravity; empty if it is near."""
-    size = float(quantile(np.linalg.norm(accel, axis=1), 0.5))
+def unusual_gravity(accel: Rows3, bias: Float64[np.ndarray, "3"] | None = None) -> str:
+    """Sentence on a median or a bias of the specific force that is not gravity's; else empty."""
+    size, off = float(quantile(np.linalg.norm(accel, axis=1), 0.5)), 0.0 if bias is None else float(np.linalg.norm(bias))
     low, high = (share * GRAVITY_M_S2 for share in GRAVITY_RANGE)
-    if low <= size <= high:
-        return ""
-    return f"the specific force has a median of {size:.3g} m/s², expected about {GRAVITY_M_S2:g}: check its unit"
+    if not low <= size <= high:
+        return f"the specific force has a median of {size:.3g} m/s², expected about {GRAVITY_M_S2:g}: check its unit"
+    without = f"the accelerometer would have a bias of {off:.3g} m/s²: it does not measure gravity, or its unit is not m/s²"
+    return without if off > GRAVITY_M_S2 - low else ""
 
 
 def unmeasured(gyro: Rows3, accel: Rows3) -> Mapping[str, Bool[np.ndarray, " n"]]:

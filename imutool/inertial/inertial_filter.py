@@ -45,6 +45,8 @@ SIZE = 27
 HAT_G, ONES = hat(G_W), np.ones(3)
 STOPPED = np.zeros((3, SIZE))  # rows of d(velocity)/d(error)
 STOPPED[:, VELOCITY] = np.eye(3)
+PLACE = np.zeros((3, SIZE))  # rows of d(position)/d(error), about the origin
+PLACE[:, POSITION] = np.eye(3)
 STILL = np.zeros((3, SIZE))  # rows of d(gyro bias at rest)/d(error)
 STILL[:, 9:12] = STILL[:, 15:18] = np.eye(3)
 HUBER = 2.0  # standard deviations of a speed, above which it gets less weight
@@ -69,6 +71,7 @@ class FilterSettings(Settings, frozen=True, kw_only=True):
     speed_m_s: Positive = 0.7  # per axis, of the pivot; of the mean velocity
     speed_correlation_s: Positive = 0.5
     pivot_m: Positive = 0.5  # per axis, of the pivot's place
+    room_m: Positive = math.inf  # per axis, of the position at each block in motion, about the first; infinite: no bound
     rest_m_s: Positive = 0.05  # of a block at rest
     rest_rad_s: Positive = 2e-4  # motion within a stop: it begins and ends slowly
     start_m_s2: Positive = 1.5  # mean acceleration over the first block: its tilt of "up"
@@ -124,7 +127,7 @@ class Step(NamedTuple):
     expected: State
     F: Covariance
     after: State
-    innovation: tuple[Vector3, Matrix3] | None = None  # of the bounded velocity, in world axes, and its covariance
+    innovation: tuple[Vector3, Matrix3] | None = None  # of the last bound, in world axes, and its covariance
 
     def of(self, k: int) -> Step:
         """Step of one filter of several."""
@@ -173,15 +176,16 @@ def motion_step(x: State, motion: Increment, rate: Vector3, missing_s: float, wa
     H[..., VELOCITY] = EYE
     H[..., STEADY] = steady = np.concatenate([R @ hat(rate), -R], axis=-1)
     noise = 2.0 * s.speed_m_s**2 * s.speed_correlation_s / T
-    return _with_velocity(step, H, step.expected.v_w + matvec(steady, x.steady), noise, HUBER)
+    step = _bounded(step, H, step.expected.v_w + matvec(steady, x.steady), noise, HUBER)
+    return _bounded(step, PLACE, step.after.p_wb, s.room_m**2, HUBER) if math.isfinite(s.room_m) else step
 
 
-def _with_velocity(step: Step, H: Float64[np.ndarray, "... 3 m"], v: Vector3, noise: float, maximum: float) -> Step:
-    """Step after a velocity that is zero but for `noise` per axis; with less weight above `maximum` standard deviations."""
-    S = H @ step.expected.P[..., :SIZE, :SIZE] @ H.swapaxes(-1, -2) + noise * EYE
-    size = np.sqrt(np.einsum("...i,...i->...", v, v) / np.einsum("...ii->...", S))
-    after = update(step.expected, H, v, noise * np.maximum(1.0, size / maximum)[..., None] ** 2 * ONES)
-    return step._replace(after=after, innovation=(v, S))
+def _bounded(step: Step, H: Float64[np.ndarray, "... 3 m"], z: Vector3, noise: float, maximum: float) -> Step:
+    """Step after a vector that is zero but for `noise` per axis; with less weight above `maximum` standard deviations."""
+    S = H @ step.after.P[..., :SIZE, :SIZE] @ H.swapaxes(-1, -2) + noise * EYE
+    size = np.sqrt(np.einsum("...i,...i->...", z, z) / np.einsum("...ii->...", S))
+    after = update(step.after, H, z, noise * np.maximum(1.0, size / maximum)[..., None] ** 2 * ONES)
+    return step._replace(after=after, innovation=(z, S))
 
 
 def rest_step(x: State, mean: Vector6, variance: Vector3, T: float, walk: Walk, s: FilterSettings) -> Step:
@@ -191,7 +195,7 @@ def rest_step(x: State, mean: Vector6, variance: Vector3, T: float, walk: Walk, 
     by_bias[..., VELOCITY, 3:], by_bias[..., POSITION, 3:] = -T * EYE, -0.5 * T**2 * EYE
     push = s.accel_density**2 * T
     step = _predict(x, x.R_wb, dv, 0.5 * T * dv, by_bias, T, (MIN_VARIANCE, push), walk, resting=True)
-    step = _with_velocity(step, STOPPED, step.expected.v_w, s.rest_m_s**2, math.inf)
+    step = _bounded(step, STOPPED, step.expected.v_w, s.rest_m_s**2, math.inf)
     rate = step.after.rest_bias(True)[..., :3] - mean[..., :3]
     return step._replace(after=update(step.after, STILL, rate, variance + s.rest_rad_s**2))
 

@@ -75,6 +75,7 @@ class Share(NamedTuple):
 
     value: float
     std: float
+    filter_std: float = 0.0  # deviation by the filter's covariances alone
 
 
 def share_of_correction(without: Innovations, corrected: Innovations) -> Share:
@@ -91,10 +92,10 @@ def share_of_correction(without: Innovations, corrected: Innovations) -> Share:
     Sd = weight[:, None] * np.linalg.solve(S, d[..., None])[..., 0]
     size = float((d * Sd).sum())
     if size <= 0.0:
-        return Share(0.0, math.inf)
+        return Share(0.0, math.inf, math.inf)
     value = float((without.e * Sd).sum()) / size
     score = ((without.e - value * d) * Sd).sum(axis=1)
     variance = score @ score
     for lag in range(1, min(LAGS, len(score) - 1) + 1):
         variance += 2.0 * (1.0 - lag / (LAGS + 1.0)) * (score[lag:] @ score[:-lag])
-    return Share(value, math.sqrt(max(float(variance), 0.0)) / size)
+    return Share(value, math.sqrt(max(float(variance), 0.0)) / size, 1.0 / math.sqrt(size))

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
+from support.switchings_on import Switchings
+from support.switchings_on import log as switched_on
 
 import imutool
 from imutool.bias import hybrid, linear, static
@@ -25,6 +27,7 @@ from imutool.inertial.stationary import CALM, white_noise
 from imutool.recording import GRAVITY_M_S2, Imu, Recording, seconds
 from imutool.sensor.made_up_flight import flight
 
+SECOND_NS = 1_000_000_000
 WRONG = np.array([[0.04, -0.02, 0.01], [0.02, -0.05, 0.03], [-0.03, 0.02, 0.04]])
 MADE_FOR = {"sensor": "made up", "dataset": "flights"}
 
@@ -158,7 +161,7 @@ def test_a_share_far_from_the_whole_correction_and_below_half_of_it_is_doubtful(
     monkeypatch: pytest.MonkeyPatch, model: BiasModel, recording: Recording, share: Share, verdict: str
 ) -> None:
     """A third of other units' models that do harm had such a share, and were said to fit."""
-    monkeypatch.setattr(fitness, "share_of_correction", lambda *given: share)
+    monkeypatch.setattr(fitness, "_share", lambda *given: share)
     assert judged(model, recording.imu).verdict == verdict
 
 
@@ -194,6 +197,24 @@ def test_a_small_correction_of_another_unit_fits_but_the_reason_says_what_the_lo
     assert found.verdict == "fits"
     assert "correction in motion" in found.reasons[0]
     assert "correction in motion" not in judged(model, recording.imu).reasons[0], "this model has none"
+
+
+@pytest.mark.parametrize("walked_m_s", [0.0, 4.0])
+def test_a_correction_of_half_a_percent_is_judged_where_the_body_stays_in_a_room(walked_m_s: float) -> None:
+    """Other units' corrections of this size did more harm than good, and were said to fit; a walk shows none."""
+    made = switched_on(1, 1, Switchings(scale=0.0, misalignment_rad=0.0, rest_s=8.0, duration_s=60.0))
+    t, truth = made.imu.t_ns, made.truth
+    R = Slerp(truth.t_ns, Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True))(np.clip(t, *truth.t_ns[[0, -1]]))
+    sets_off = 0.5 * walked_m_s * ((t >= t[0] + 10 * SECOND_NS) & (t < t[0] + 12 * SECOND_NS))
+    exact = replace(made.imu, accel=made.imu.accel + R.inv().apply(sets_off[:, None] * [1.0, 0.0, 0.0]))
+    statistics = {"prior_mean": imutool.debias(made, "static").start.rest, "prior_std": np.array([1e-3] * 3 + [0.05] * 3)}
+    unit = linear.Model(linear.Config(), 100.0, statistics)
+    unit.card = {"name": "own", "logs": [{}] * 3}
+    scale = -0.1 * WRONG
+    own = judged(corrects(unit, scale), replace(exact, gyro=exact.gyro @ (np.eye(3) + scale).T))
+    other = judged(corrects(unit, scale), exact)
+    assert own.verdict == "fits", own.reasons
+    assert (other.verdict == "doubtful") == (walked_m_s == 0.0), other.reasons
 
 
 @pytest.mark.parametrize(("bias", "verdict"), [(1.5, "fits"), (9.7, "unfit"), (-8.8, "unfit")])

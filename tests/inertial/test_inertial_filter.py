@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import (
     BIAS,
+    POSITION,
     SIZE,
     STOPPED,
     VELOCITY,
@@ -158,3 +159,14 @@ def test_a_stop_counts_in_full_however_fast_the_estimate() -> None:
     P[VELOCITY, VELOCITY] = np.eye(3)
     after = rest_step(x._replace(P=P), np.array([0.0, 0.0, 0.0, 0.5, -0.3, 9.7]), np.full(3, 1e-8), 0.5, WALK, S)
     assert np.diag(after.after.P[VELOCITY, VELOCITY]).max() < 1.01 * S.rest_m_s**2
+
+
+def test_a_room_bounds_the_position() -> None:
+    x = steps(start())[-1].after
+    t = np.arange(101) / 200.0
+    motion = integrate(t, np.full((101, 3), 0.2), np.tile([0.0, 0.5, 9.8], (101, 1)))
+    free, inside = (motion_step(x, motion, np.full(3, 0.2), 0.0, WALK, s) for s in (S, FilterSettings(room_m=2.0)))
+    assert inside.innovation is not None
+    np.testing.assert_allclose(inside.innovation[0], free.after.p_wb, rtol=0, atol=EXACT)
+    np.testing.assert_allclose(inside.innovation[1], free.after.P[POSITION, POSITION] + 4.0 * np.eye(3), rtol=0, atol=EXACT)
+    assert np.linalg.norm(inside.after.p_wb) < np.linalg.norm(free.after.p_wb)
