@@ -90,7 +90,8 @@ class Journal:
                 self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  closed with the journal
                 self._pieces = _Pieces(self.path, self._file)
         except io_errors(out) as error:
-            raise ConfigError(f"cannot be written ({reason(error)})", where=out, expected="a folder as OUT") from error
+            where, expected = getattr(error, "filename", None) or out, "a folder as OUT that can be written"
+            raise ConfigError(f"cannot be written ({reason(error)})", where=where, expected=expected) from error
         try:
             self._lock()
             known = self._read()
@@ -161,8 +162,9 @@ class Journal:
         except io_errors(self.path) as error:
             with contextlib.suppress(OSError):
                 self._file.truncate(at)
-            what, fix = f"cannot be written ({reason(error)})", "Make room, and go on with `resume`"
-            raise ConfigError(what, where=self.path, fix=fix) from error
+            what = f"cannot be written ({reason(error)})"
+            fix = "Make room" if self._pieces is None else "Check the address and your access to the store"
+            raise ConfigError(what, where=self.path, fix=f"{fix}, and go on with `resume`") from error
         return at, len(raw)
 
     def _lock(self) -> None:

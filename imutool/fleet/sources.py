@@ -93,9 +93,10 @@ def find(text: str, out: Location, *, bags: bool = False, once: bool = False) ->
             before = taken.setdefault(name.casefold(), where)  # one file on some systems, two on others
             if before != where:
                 raise ConfigError(f"would be called {name}, and so would {before}", fix="Rename one of the two")
-            if about is None and exists(Path(where)) and not Path(where).is_file():
+            place = to_location(where)
+            if isinstance(place, Path) and exists(place) and not place.is_file():
                 raise ConfigError("is a pipe, a socket or a device", expected="a file", fix="Remove it")
-            logs.append(Source(where, name, *(identity(Path(where)) if about is None else size_and_etag(about))))
+            logs.append(Source(where, name, *(identity(place) if about is None else size_and_etag(about))))
         except ConfigError as error:
             refused.append((shown(where), str(error)))
     if not logs and not refused and outputs:
@@ -165,6 +166,8 @@ def with_simulations(found: Found, sim: str | None) -> Found:
 def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
     """Root folder of the names, and the files."""
     where = to_location(text)
+    if text.startswith(WEB):
+        return _on_web(text, endings)
     if not isinstance(where, Path):
         return _in_store(text, endings)
     if is_folder(where):
@@ -179,11 +182,27 @@ def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
         root /= parts.pop(0)
     fitting = _fitting(root, parts, frozenset()) if is_folder(root) else ()
     files = {os.path.abspath(file.where): file.unread for file in fitting}  # noqa: PTH100  Path.resolve would follow links
+    return str(absolute(root)), _logs(files, endings)
+
+
+def _on_web(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
+    """Root and files on a web server."""
+    match = PATTERN.search(text)
+    if match is None and _ends(text, endings):  # to list one file, the library would fetch it and look for links in it
+        return text.rpartition("/")[0], iter([_File(text)])
+    root = text.rstrip("/") if match is None else text[: match.start()].rpartition("/")[0]
+    top, parts = to_location(root), text[len(root) + 1 :].split("/")
+    found = _walk(top, endings, frozenset()) if match is None else _fitting(top, parts, frozenset())
+    return root, _logs({file.where: file.unread for file in found}, endings)
+
+
+def _logs(files: dict[str, str], endings: tuple[str, ...]) -> Iterator[_File]:
+    """Logs among files, each once, and what could not be read."""
     found = (_File(where, unread=files[where]) for where in sorted(files))
-    return str(absolute(root)), (file for file in found if file.unread or _ends(file.where, endings))
+    return (file for file in found if file.unread or _ends(file.where, endings))
 
 
-def _fitting(folder: Path, parts: Sequence[str], above: frozenset[tuple[int, int]]) -> Iterator[_File]:
+def _fitting(folder: Location, parts: Sequence[str], above: frozenset[object]) -> Iterator[_File]:
     """Files below a folder that fit the parts of a pattern, never through a link to a parent folder."""
     part, *rest = parts
     if part == "..":
@@ -201,7 +220,7 @@ def _fitting(folder: Path, parts: Sequence[str], above: frozenset[tuple[int, int
             yield from _fitting(folder / name, parts, above | {inode})
 
 
-def _walk(folder: Path, endings: tuple[str, ...], above: frozenset[tuple[int, int]]) -> Iterator[_File]:
+def _walk(folder: Location, endings: tuple[str, ...], above: frozenset[object]) -> Iterator[_File]:
     """Logs below a folder, through links too, but never through a link to a parent folder."""
     inode, folders, files, unread = _listed(folder)
     if inode in above:
@@ -212,14 +231,22 @@ def _walk(folder: Path, endings: tuple[str, ...], above: frozenset[tuple[int, in
     yield from (_File(str(folder / name)) for name in files if _ends(name, endings))
 
 
-def _listed(folder: Path) -> tuple[tuple[int, int], list[str], list[str], list[_File]]:
+def _listed(folder: Location) -> tuple[object, list[str], list[str], list[_File]]:
     """Inode of a folder, the folders and files in it, and what of it cannot be read."""
     folders, files, unread = list[str](), list[str](), list[_File]()
+    if not isinstance(folder, Path):  # the library's own walk passes over a folder where the server does not answer
+        try:
+            for entry in folder.fs.ls(folder.path, detail=True):
+                name = entry["name"][len(folder.path.rstrip("/")) :].strip("/").removeprefix("./")
+                (folders if entry["type"] == "directory" else files).append(name)
+        except io_errors(folder) as error:
+            unread.append(_File(str(folder), unread=reason(error)))
+        return str(folder), sorted(filter(None, folders)), sorted(filter(None, files)), unread
     try:
         status = folder.stat()
         entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
     except OSError as error:
-        return (0, 0), [], [], [_File(str(folder), unread=reason(error))]
+        return None, [], [], [_File(str(folder), unread=reason(error))]
     for entry in entries:
         try:
             (folders if entry.is_dir() else files).append(entry.name)
@@ -245,24 +272,13 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
     root = to_location(fixed)
     assert not isinstance(root, Path), "a URL, not a path"
     try:
-        if match is not None:
-            found = root.fs.glob(root.path.rstrip("/") + text[len(fixed) :], detail=True)
-        elif fixed.startswith(WEB) and _ends(fixed, endings):
-            found = {root.path: {}}  # one file: to list it, the library would fetch the whole log and look for links in it
-        else:
-            found = root.fs.find(root.path, detail=True)
+        pattern = root.path.rstrip("/") + text[len(fixed) :]
+        found = root.fs.find(root.path, detail=True) if match is None else root.fs.glob(pattern, detail=True)
     except io_errors(root) as error:
         raise ConfigError(f"cannot be listed ({reason(error)})", where=text) from error
-    unread = dict[str, str]()
-    for path, about in found.items():
-        if about.get("size") is None and _ends(path, endings):  # a web server lists names alone
-            try:
-                found[path] = root.fs.info(path)
-            except io_errors(root) as error:
-                unread[path] = reason(error)
     whole = fixed.rpartition("/")[0] if list(found) == [root.path] else fixed  # a log alone, by its own name
     files = [
-        _File(fixed + path[len(root.path.rstrip("/")) :], about, unread.get(path, ""))
+        _File(fixed + path[len(root.path.rstrip("/")) :], about)
         for path, about in sorted(found.items())
         if about and about.get("type", "file") == "file" and _ends(path, endings)
     ]

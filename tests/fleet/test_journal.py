@@ -54,6 +54,13 @@ def test_a_file_is_no_folder_of_a_fleet(tmp_path: Path) -> None:
         fill(out, "a")
 
 
+def test_a_journal_that_cannot_be_opened_is_named(tmp_path: Path) -> None:
+    """As one that another user wrote, in a folder that all may write to."""
+    (tmp_path / NAME).mkdir()
+    with pytest.raises(ConfigError, match=f"^{re.escape(str(tmp_path / NAME))}: cannot be written"):
+        fill(tmp_path, "a")
+
+
 def test_a_full_disk_is_told_with_the_journal_and_what_to_do(tmp_path: Path) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     told = re.escape(f"{tmp_path / NAME}: cannot be written (File too large). Make room, and go on with `resume`")

@@ -5,7 +5,10 @@ from __future__ import annotations
 import errno
 import os
 import socket
+import struct
 import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -260,21 +263,28 @@ class _WebServer(SimpleHTTPRequestHandler):
         """Say nothing."""
 
 
-def test_a_web_server_is_listed_although_it_tells_no_sizes(tmp_path: Path) -> None:
-    tree(tmp_path, "robots/a/log.mcap", "robots/b/notes.txt", "robots/b/other.mcap", "robots/c/run 1 (é).mcap")
-    (tmp_path / "robots" / "latest.mcap").symlink_to("removed.mcap")
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_WebServer, directory=str(tmp_path))) as server:
+@contextmanager
+def _web(folder: Path, handler: type[SimpleHTTPRequestHandler] = _WebServer) -> Iterator[str]:
+    """Address of a web server that shows a folder."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(handler, directory=str(folder))) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:
-            root = f"http://127.0.0.1:{server.server_port}/robots"
-            found, refused = find(root, NOWHERE)
-            compared = with_simulations(Found(found, []), root)
-            (alone,) = find(f"{root}/b/other.mcap", NOWHERE).logs
-            assert identity(to_location(alone.place)) == (alone.size, alone.stamp)
+            yield f"http://127.0.0.1:{server.server_port}"
         finally:
             server.shutdown()
             thread.join()
+
+
+def test_a_web_server_is_listed_although_it_tells_no_sizes(tmp_path: Path) -> None:
+    tree(tmp_path, "robots/a/log.mcap", "robots/b/notes.txt", "robots/b/other.mcap", "robots/c/run 1 (é).mcap")
+    (tmp_path / "robots" / "latest.mcap").symlink_to("removed.mcap")
+    with _web(tmp_path) as server:
+        root = f"{server}/robots"
+        found, refused = find(root, NOWHERE)
+        compared = with_simulations(Found(found, []), root)
+        (alone,) = find(f"{root}/b/other.mcap", NOWHERE).logs
+        assert identity(to_location(alone.place)) == (alone.size, alone.stamp)
     assert [(log.place, log.name, log.size) for log in found] == [
         (f"{root}/a/log.mcap", "a/log.mcap", len("robots/a/log.mcap")),
         (f"{root}/b/other.mcap", "b/other.mcap", len("robots/b/other.mcap")),
@@ -285,3 +295,32 @@ def test_a_web_server_is_listed_although_it_tells_no_sizes(tmp_path: Path) -> No
     assert [where for where, _ in refused] == [f"{root}/latest.mcap"]
     assert alone.name == "other.mcap"
     assert alone.stamp  # of the last change: a log of the same size is another one
+
+
+class _PartlySilent(_WebServer):
+    def do_GET(self) -> None:
+        """Answer, but for a folder reset the connection, or say that it is not there."""
+        if self.path.rstrip("/").endswith("/reset"):
+            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            self.close_connection = True
+        elif self.path.rstrip("/").endswith("/missing"):
+            self.send_error(404)
+        else:
+            super().do_GET()
+
+
+@pytest.mark.parametrize("pattern", ["", "/**/*.mcap", "/*/*.mcap"])
+def test_a_folder_for_which_a_web_server_does_not_answer_is_no_empty_one(tmp_path: Path, pattern: str) -> None:
+    tree(tmp_path, "robots/a/log.mcap", "robots/missing/log.mcap", "robots/reset/log.mcap")
+    with _web(tmp_path, _PartlySilent) as server:
+        found, refused = find(f"{server}/robots{pattern}", NOWHERE)
+    assert [log.name for log in found] == ["a/log.mcap"]
+    assert [where for where, _ in refused] == [f"{server}/robots/missing", f"{server}/robots/reset"]
+
+
+def test_a_web_server_that_is_away_is_named() -> None:
+    with closing(socket.create_server(("127.0.0.1", 0))) as free:
+        root = f"http://127.0.0.1:{free.getsockname()[1]}/robots"
+    found, ((where, why),) = find(root, NOWHERE)
+    assert (found, where) == ([], root)
+    assert "Connect" in why

@@ -229,6 +229,9 @@ def _zenoh(name: str, malformed: Malformed) -> Samples:
     import zenoh
 
     parts, config, arrived = urlsplit(name), zenoh.Config(), Queue[tuple[float, bytes]](MAX_WAITING)
+    key = parts.path.strip("/")
+    if not key:
+        raise ConfigError(f"{name!r} names no key", where="source", expected="zenoh://[HOST:PORT]/KEY")
     if parts.netloc:  # else peers are found on the local network
         config.insert_json5("connect/endpoints", f'["tcp/{parts.netloc}"]')
         config.insert_json5("mode", '"client"')
@@ -242,7 +245,7 @@ def _zenoh(name: str, malformed: Malformed) -> Samples:
             malformed.add(payload, ValueError(f"lost: {MAX_WAITING} messages wait already ({error!r})"))
 
     try:
-        session.enter_context(zenoh.open(config)).declare_subscriber(parts.path.strip("/"), arrive)
+        session.enter_context(zenoh.open(config)).declare_subscriber(key, arrive)
     except zenoh.ZError as error:
         session.close()
         raise ConfigError(

@@ -250,6 +250,12 @@ def test_a_wrong_source_is_refused_at_once(name: str) -> None:
         open_source(name, Malformed())
 
 
+def test_a_zenoh_address_without_a_key_says_so() -> None:
+    """Zenoh itself names a place in its own source code."""
+    with pytest.raises(ConfigError, match=r"'zenoh://127\.0\.0\.1:1/' names no key; expected zenoh://\[HOST:PORT\]/KEY"):
+        open_source("zenoh://127.0.0.1:1/", Malformed())
+
+
 def test_closed_standard_input_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdin", None)  # as Python does for `<&-`
     with pytest.raises(ConfigError, match="standard input is closed"):
@@ -353,8 +359,8 @@ def test_zenoh_carries_json_and_cdr(imu: Imu) -> None:
     config.insert_json5("scouting/multicast/enabled", "false")
     malformed = Malformed()
     with zenoh.open(config) as session:
-        source = open_source(f"zenoh://127.0.0.1:{port}/robot/imu", malformed)
-        publisher = session.declare_publisher("robot/imu")
+        source = open_source(f"zenoh://127.0.0.1:{port}/0/robot/imu/**", malformed)
+        publisher = session.declare_publisher("0/robot/imu/sensor_msgs::msg::dds_::Imu_/RIHS01_0")  # as rmw_zenoh's keys are
         while not publisher.matching_status.matching:
             time.sleep(0.01)
         publisher.put(lines(imu)[0])
