@@ -49,9 +49,9 @@ def error_curves(data: RunData) -> Picture | None:
 
 
 def drift_curves(data: RunData) -> Picture | None:
-    """Orientation and position drift since the last reset to the truth; None without truth."""
+    """Orientation and position drift since the last reset to the truth; None without a reset."""
     with_drift = [(trace, trace.drift) for trace in data.traces if trace.drift is not None]
-    if not with_drift:
+    if all(len(_resets(drift)) < 2 for _, drift in with_drift):  # the first is the true start, as of the errors
         return None
     scored, drifts = [trace for trace, _ in with_drift], [drift for _, drift in with_drift]
     caption = f"Set to the truth every {drifts[0].reset_s:g} s."

@@ -98,7 +98,7 @@ def spectrum(data: RunData) -> Picture | None:
 def allan_deviation(data: RunData) -> Picture | None:
     """Allan deviations at rest, raw and corrected.
 
-    Nothing where it does not rest for long, or where allantools is not installed (`left_out` says so).
+    Nothing where it does not rest for long or reads a constant, or where allantools is not installed (`missing_pictures`).
     """
     if find_spec("allantools") is None:
         return None
@@ -126,7 +126,10 @@ def allan_deviation(data: RunData) -> Picture | None:
             f"{TITLES[sensor]} Allan deviation",
         )
         for sensor in SENSORS
+        if any(deviation.any() for _, _, deviation in curves[sensor])  # a constant has none
     ]
+    if not panels:
+        return None
     caption = f"Over {format_number(rest_s)} s at rest in {len(ranges)} stretch{'es' * (len(ranges) > 1)}; overlapping."
     caption = " ".join([caption, *(f"{remark[0].upper()}{remark[1:]}." for sensor in SENSORS for remark in remarks[sensor])])
     return Picture("allan", "Allan deviation at rest", caption, tuple(panels))

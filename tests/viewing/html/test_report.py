@@ -30,7 +30,7 @@ from imutool.viewing.model import decimation
 from imutool.viewing.model.events import Event
 from imutool.viewing.model.load_view import build
 from imutool.viewing.model.run_data import Run, RunData, Trace
-from imutool.viewing.model.trajectory_error import Drift, Errors, Window
+from imutool.viewing.model.trajectory_error import RESET_S, Drift, Errors, Window
 
 Page, svgs, curves = markup.Page, markup.svgs, markup.curves
 SECONDS, STILL_S = 20.0, 6.0  # of a flight, and of its rest before that
@@ -87,7 +87,7 @@ def panel(data: RunData, make: Callable[[RunData], drawing.Picture | None], whic
     assert picture is not None
     one = picture.panels[which]
     with mock.patch.dict(drawing.STYLE, {"path.simplify": False}):  # else matplotlib leaves out what no pixel would show
-        return drawing.svg(one.draw, one.height_inch, "test", width_inch=drawing.HALF_INCH, label=one.label)
+        return drawing.svg(one.draw, one.height_inch, "test", width_inch=drawing.HALF_INCH)
 
 
 # ── what it says ──
@@ -479,6 +479,7 @@ def test_a_sensor_that_reads_zero_is_drawn(flown: Recording) -> None:
     data = build(dead, [Run.raw(dead.imu)])
     assert not re.search(r"\bnan\b", Page(report.page([data])).text, re.IGNORECASE)
     assert report_signals.spectrum(data) is None  # its panels were empty
+    assert report_signals.allan_deviation(data) is None
 
 
 @pytest.mark.usefixtures("words_alone")
@@ -499,6 +500,15 @@ def test_a_run_that_begins_later_is_at_rest_at_the_same_times(flown: Recording, 
     assert report_signals.allan_deviation(data) is not None
     of_raw, _, of_late, _ = stretches
     np.testing.assert_array_equal(of_late[0], of_raw[0][200:])
+
+
+def test_without_a_reset_the_drift_is_the_error_and_is_not_drawn_twice(flown: Recording) -> None:
+    first_ns = int(flown.imu.t_ns[0])
+    for seconds, drawn in ((RESET_S / 2.0, False), (1.5 * RESET_S, True)):
+        short = flown.between(first_ns, first_ns + round(seconds * 1e9))
+        data = build(short, [Run.raw(short.imu)])
+        assert report_errors.error_curves(data) is not None
+        assert (report_errors.drift_curves(data) is not None) == drawn
 
 
 @pytest.mark.usefixtures("words_alone")
@@ -555,7 +565,7 @@ def test_names_from_anywhere_are_words_and_nothing_else(seen: RunData) -> None:
 
 def test_every_drawing_has_a_name_and_the_pages_own_colours(page: str) -> None:
     for svg in svgs(page):
-        assert re.match(r'<svg role="img" aria-label="[^"]+"', svg)
+        assert re.match(r'<svg role="img" aria-label="[^"]+"', svg.replace(' class="wide"', ""))
         assert not re.findall(r"#[0-9a-fA-F]{6}\b", svg)
         assert set(re.findall(r"var\(--(\w+)\)", svg)) <= LIGHT.keys()
     for name in LIGHT:
