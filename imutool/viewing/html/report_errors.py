@@ -115,15 +115,19 @@ def _draw(
             line = axes.plot(*curve, lw=0.9 if trace.is_raw else 1.3, label=label, **style)
             lines += line if axes is panels[0] else []
         _limits(axes, values, signed=signed, log=log)
-        if beyond:
-            axes.set_title(
-                f"off scale: {', '.join(beyond)}", loc="right", fontsize="small", fontweight="normal", color=INK, pad=2.0
-            )
+        name_off_scale(axes, beyond)
         axes.set_ylabel(f"{name} ({unit})" if len(rows) > 1 else f"{title.lower()} ({unit})")
     panels[0].set_title(title)
     panels[-1].set(xlabel="time (s)", xlim=(0.0, data.duration_s))
     figure.align_ylabels(panels)
     legend(figure, lines)
+
+
+def name_off_scale(axes: Any, beyond: Sequence[str]) -> None:
+    """Name above a panel what leaves it."""
+    if beyond:
+        words = f"off scale: {', '.join(beyond)}"
+        axes.set_title(words, loc="right", fontsize="small", fontweight="normal", color=INK, pad=2.0)
 
 
 def _limits(axes: Any, values: Sequence[Line], *, signed: bool, log: bool) -> None:

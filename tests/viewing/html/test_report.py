@@ -33,6 +33,7 @@ from imutool.viewing.model.run_data import Run, RunData, Trace
 from imutool.viewing.model.trajectory_error import RESET_S, Drift, Errors, Window
 
 Page, svgs, curves = markup.Page, markup.svgs, markup.curves
+APART = 2.0  # points between two curves that are seen as two
 SECONDS, STILL_S = 20.0, 6.0  # of a flight, and of its rest before that
 HOUR = 720_000  # samples at 200 Hz
 MAX_BYTES, MAX_BYTES_OF_AN_HOUR = 1_500_000, 6_000_000
@@ -255,6 +256,16 @@ def test_every_run_has_its_curve_in_every_panel_it_belongs_to(seen: RunData, pag
     assert titles.count("true, y") == 2
     assert titles.count("±3 σ, x") == 2
     assert titles.count("truth") == len([svg for svg in svgs(page) if "Paths:" in svg])
+
+
+def test_a_wide_band_leaves_the_panel_that_its_curves_share(flown: Recording) -> None:
+    bias = np.concatenate([flown.scalars[f"/ground_truth/bias/{kind}"].values[0] for kind in ("gyro", "accel")])
+    for std, named in ((1.0, True), (0.004, False)):
+        runs = [subtract(flown, "sure", bias, std=0.002), subtract(flown, "vague", 0.5 * bias, std=std)]
+        drawn = panel(build(flown, [Run.raw(flown.imu), *runs]), report_signals.biases, 0)
+        assert drawn.count("off scale: ±3 σ of vague, 6.00 wide") == 3 * named
+        sure, vague = (curves(drawn)[name][:, 1].mean() for name in ("sure", "vague"))
+        assert abs(sure - vague) > APART
 
 
 def test_a_sample_near_the_largest_number_is_drawn(seen: RunData, flown: Recording) -> None:
