@@ -26,8 +26,8 @@ MAX_NAMED = 10  # robots with an effect
 EQUAL = 1e-6  # of the largest of several values, by which they may differ
 BINS = 30
 OWN_STYLE = """
-.failed { color: var(--before); font-weight: 600; } .quarantined, .lost { color: var(--mark); font-weight: 600; }
-td.quarantined { white-space: nowrap; } td.log { min-width: 9em; } td.log + td { min-width: 16em; }
+.failed, .quarantined, .lost { font-weight: 600; border-left: 4px solid var(--mark); padding-left: 8px; white-space: nowrap; }
+.failed { border-left-color: var(--before); } td.log { min-width: 9em; } td.log + td { min-width: 16em; }
 @media (min-width: 900px) { td.log { min-width: 24em; } }
 """
 
@@ -151,11 +151,12 @@ def _logs(statistics: Statistics, link: Links) -> Iterator[str]:
         return
     yield "<h2>Logs</h2>"
     rows = "".join(
-        f'<tr><td><a href="{text(link.to(result.page))}">{text(result.page.removesuffix(".html"))}</a></td>'
+        f'<tr><td class="log"><a href="{text(link.to(result.page))}">{text(result.page.removesuffix(".html"))}</a></td>'
         f"<td>{text(result.page_says)}</td></tr>"
         for result in statistics.drawn
     )
-    yield f"<table><thead><tr><th>Log</th><th>What its page says</th></tr></thead><tbody>{rows}</tbody></table>"
+    head = "<th>Log</th><th>What its page says</th>"
+    yield f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
     if statistics.pages > len(statistics.drawn):
         yield f'<p class="note">{statistics.pages - len(statistics.drawn):,} more pages are next to their logs.</p>'
 

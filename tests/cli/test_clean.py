@@ -203,6 +203,12 @@ def test_a_page_says_yes_instead_of_true_and_a_unit_behind_its_number(folder: Pa
     assert "at rest yes, longest 0.5 s" in cleaning_page.html([replace(found, findings=(rested,))])
 
 
+def test_a_page_names_dropped_samples_only_where_there_are_some(folder: Path) -> None:
+    found = survey(folder / "spoiled.mcap")
+    assert "leaves out the samples listed below as dropped" in cleaning_page.html([found])
+    assert "dropped." not in cleaning_page.html([replace(found, dropped=np.zeros_like(found.dropped))])
+
+
 def test_a_page_of_a_log_cleaned_with_force_does_not_deny_it(folder: Path) -> None:
     found = replace(survey(folder / "spoiled.mcap"), reasons=("nobody trusts it",))
     assert "it is not cleaned" in cleaning_page.html([found])

@@ -22,6 +22,7 @@ LINES = {
     "walk": (0, (1, 1)),
     "ramp": (0, (1, 3)),
 }
+MARKERS = ("o", "s", "^")  # red and green alone are one colour to some
 HEIGHT_INCH = 3.8
 
 
@@ -47,9 +48,9 @@ def write_png(identified: IdentifiedNoise, path: Path, *, overwrite: bool) -> No
 def _draw(figure: Any, *, source: CurveSource, sensor: Sensor) -> None:
     axes = figure.subplots()
     curve = source.curves[sensor]
-    for axis, (slopes, color) in enumerate(zip(source.slopes[sensor], AXIS_COLORS, strict=True)):
+    for axis, (slopes, color, marker) in enumerate(zip(source.slopes[sensor], AXIS_COLORS, MARKERS, strict=True)):
         error = curve.deviation[:, axis] / np.sqrt(2.0 * curve.freedom)
-        axes.errorbar(curve.tau_s, curve.deviation[:, axis], error, fmt="o", ms=4, color=color, lw=0.8, label=AXES[axis])
+        axes.errorbar(curve.tau_s, curve.deviation[:, axis], error, fmt=marker, ms=4, color=color, lw=0.8, label=AXES[axis])
         if not slopes.powers:
             continue
         tau_s = np.geomspace(slopes.from_s, curve.tau_s[-1], 200)

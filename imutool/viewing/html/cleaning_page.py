@@ -13,7 +13,7 @@ from imutool.viewing.html.page import document, text
 
 VERDICTS = {
     "good": "no sample has a fault",
-    "usable": "usable; the clean channel leaves out the samples listed below as dropped",
+    "usable": "usable",
     "quarantine": "not trustworthy; it is not cleaned",
 }
 FORCED = "not trustworthy; the clean channel is written because `force` asks for it, and leaves out invalid samples alone"
@@ -53,6 +53,8 @@ def _sentence(survey: Survey) -> str:
     counts = f"{survey.valid} of {survey.messages} samples in {seconds:.1f} s are valid, {survey.missing} are missing"
     forced = survey.verdict == "quarantine" and survey.settings.force
     parts = [f"{counts}: {FORCED if forced else VERDICTS[survey.verdict]}"]
+    if survey.verdict == "usable" and survey.valid < survey.messages:
+        parts.append("the clean channel leaves out the samples listed below as dropped")
     if survey.scale[3] != 1.0:
         parts.append(f"accel is multiplied by {survey.scale[3]:.6g}")
     if survey.scale[0] != 1.0:
@@ -96,5 +98,5 @@ def _strip(finding: Finding, survey: Survey) -> str:
         at = min(max((first - survey.start_ns) / length, 0.0), 1.0 - MIN_WIDTH)
         width = min(max((last - first) / length, MIN_WIDTH), 1.0 - at)
         marks.append(f'<rect x="{1000 * at:.2f}" width="{1000 * width:.2f}" height="14" fill="{COLORS[finding.severity]}"/>')
-    svg = f'<svg viewBox="0 0 1000 14" preserveAspectRatio="none" style="{STRIP}">{"".join(marks)}</svg>'
+    svg = f'<svg aria-hidden="true" viewBox="0 0 1000 14" preserveAspectRatio="none" style="{STRIP}">{"".join(marks)}</svg>'
     return f'{svg}<div class="note">{when}</div>'

@@ -178,7 +178,7 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
         return
     found = bool(d.findings)
     legend = BEFORE + AFTER if found else DIFFERENCE
-    over = "unseen time of all logs" if any(trace.held_out.any() for trace in d.traces) else "all time: none was held out"
+    over = "all unseen time" if any(trace.held_out.any() for trace in d.traces) else "all time: none was held out"
     yield f"<h2>{'Before and after' if found else 'Difference'}</h2>"
     for k, trace in enumerate(d.traces[:MAX_LOGS]):
         drawn = figures.residual(trace, found=found)
@@ -188,13 +188,15 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
         drawn = figures.scalar_signal(d.signals[signal], found=found_in[signal])
         yield figure_of(drawn, f"g{k}", f"{text(signal)}: over time. {legend}{HELD}")
     if len(d.traces) > MAX_LOGS:
-        yield f'<p class="note">The first {MAX_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'
+        yield f'<p class="note">The first {MAX_LOGS} of {len(d.traces)} stretches are drawn; all are in the .rrd.</p>'
     if not d.traces:
         return
     spectrum, rate, attitude = figures.spectrum(d), figures.residual_against_rate(d), figures.residual_against_attitude(d)
     if spectrum is not None:
         yield figure_of(
-            spectrum, "s", f"Spectrum over {over} (Welch, mean of the axes); dashed: white noise of the floor's size. {legend}"
+            spectrum,
+            "s",
+            f"Spectrum over {over} (Welch, mean of the axes); dashed: white noise as large as the noise floor. {legend}",
         )
     else:
         yield '<p class="note">Every unseen stretch is too short for a spectrum.</p>'
@@ -202,7 +204,7 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
     if paths is not None:
         true = '<span class="key" style="background: var(--ink); opacity: 0.4"></span>true'
         yield figure_of(
-            paths, "p", f"Integrated from the true start of each stretch of {over}; drift as root mean square.{true}{legend}"
+            paths, "p", f"Integrated from the true start of each stretch, {over}; drift as root mean square.{true}{legend}"
         )
     bands = "means in bins, with two standard errors"
     if rate is not None:

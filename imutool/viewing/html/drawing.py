@@ -82,7 +82,7 @@ class Picture:
     panels: tuple[Panel, ...]
 
 
-def svg(draw: Callable[[Any], None], height_inch: float, name: str, *, width_inch: float = WIDTH_INCH, label: str = "") -> str:
+def svg(draw: Callable[[Any], None], height_inch: float, name: str, *, width_inch: float = WIDTH_INCH) -> str:
     """Draw an `<svg>` element: colours are CSS variables, numbers have two decimals.
 
     Every labelled curve has a `<title>`, which a browser shows as a tooltip.
@@ -106,7 +106,7 @@ def svg(draw: Callable[[Any], None], height_inch: float, name: str, *, width_inc
     drawn = re.sub(r'<g id="(curve-\d+)">', lambda g: f"{g[0]}<title>{text(titles[g[1]])}</title>", drawn)
     for color, variable in VARIABLES.items():
         drawn = drawn.replace(color, f"var(--{variable})")
-    return drawn.replace("<svg", f'<svg role="img" aria-label="{text(label)}"', 1) if label else drawn
+    return drawn.replace("<svg", '<svg class="wide"', 1) if width_inch > HALF_INCH else drawn
 
 
 def png(picture: Picture, heading: str) -> bytes:
@@ -133,10 +133,12 @@ def png(picture: Picture, heading: str) -> bytes:
         return _content(figure, format="png", metadata={"Software": None})
 
 
-def figure_of(drawn: str, prefix: str, caption: str = "") -> str:
-    """Figure of a drawing, whose identifiers get a prefix: a page holds several drawings."""
+def figure_of(drawn: str, prefix: str, caption: str = "", label: str = "") -> str:
+    """Figure of a drawing with its caption or label; a prefix makes its identifiers unique."""
     own = re.sub(r'(?<= id=")|(?<=href="#)|(?<=url\(#)', f"{prefix}-", drawn)
-    return f"<figure>{own}{f'<figcaption>{caption}</figcaption>' if caption else ''}</figure>"
+    name = f'aria-labelledby="{prefix}-caption"' if caption else f'aria-label="{text(label)}"'
+    own = own.replace("<svg", f'<svg role="img" {name}', 1)
+    return f"<figure>{own}{f'<figcaption id={prefix}-caption>{caption}</figcaption>' if caption else ''}</figure>"
 
 
 def legend(figure: Any, artists: Sequence[Any]) -> None:

@@ -58,7 +58,7 @@ LIGHT = {
     "after": "#0072b2",
     "second": "#009e73",
     "third": "#cc79a7",
-    "fourth": "#8a6d00",
+    "fourth": "#7a1fd1",
     "mark": "#e6a700",
     "held": "#7a7a7a",
     "x": "#dd3333",
@@ -82,7 +82,7 @@ DARK = LIGHT | {
     "after": "#56b4e9",
     "second": "#2cc79b",
     "third": "#e59cc6",
-    "fourth": "#d2b13c",
+    "fourth": "#8b55f6",
     "mark": "#f0c040",
     "held": "#9a9a9a",
     "x": "#ff6b6b",
@@ -142,6 +142,8 @@ td.number, .entry { white-space: nowrap; font-variant-numeric: tabular-nums; }
 code { font: 13px/1.4 ui-monospace, "DejaVu Sans Mono", monospace; }
 figure { margin: 10px 0 0; break-inside: avoid; }
 figure svg { display: block; width: 100%; height: auto; }
+@media screen and (max-width: 600px) { figure { overflow-x: auto; } figure svg.wide { width: 770px; }
+  figcaption { position: sticky; left: 0; } }
 figure svg * { stroke-linejoin: round; stroke-linecap: butt; }
 figcaption, .note { color: var(--soft); font-size: 13px; margin: 4px 0; overflow-wrap: anywhere; }
 .numbers { display: flex; flex-wrap: wrap; gap: 10px; margin: 12px 0; }

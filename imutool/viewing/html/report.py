@@ -191,13 +191,13 @@ def _drawn(picture: Picture, key: str, drawn: Mapping[str, str]) -> Iterator[str
     yield '<div class="pair">' if not picture.panels[0].wide else "<div>"
     for k, panel in enumerate(picture.panels):
         name = f"{key}-{picture.name}-{k}"
-        yield figure_of(drawn.get(name) or _svg(panel, picture.name, k), name)
+        yield figure_of(drawn.get(name) or _svg(panel, picture.name, k), name, label=panel.label)
     yield "</div></section>"
 
 
 def _svg(panel: Panel, picture: str, number: int) -> str:
     width = WIDTH_INCH if panel.wide else HALF_INCH
-    return svg(panel.draw, panel.height_inch, f"{picture}-{number}", width_inch=width, label=panel.label)
+    return svg(panel.draw, panel.height_inch, f"{picture}-{number}", width_inch=width)
 
 
 def _figures(data: RunData, key: str) -> Iterator[str]:

@@ -49,9 +49,9 @@ def error_curves(data: RunData) -> Picture | None:
 
 
 def drift_curves(data: RunData) -> Picture | None:
-    """Orientation and position drift since the last reset to the truth; None without truth."""
+    """Orientation and position drift since the last reset to the truth; None without a reset."""
     with_drift = [(trace, trace.drift) for trace in data.traces if trace.drift is not None]
-    if not with_drift:
+    if all(len(_resets(drift)) < 2 for _, drift in with_drift):  # the first is the true start, as of the errors
         return None
     scored, drifts = [trace for trace, _ in with_drift], [drift for _, drift in with_drift]
     caption = f"Set to the truth every {drifts[0].reset_s:g} s."
@@ -115,15 +115,19 @@ def _draw(
             line = axes.plot(*curve, lw=0.9 if trace.is_raw else 1.3, label=label, **style)
             lines += line if axes is panels[0] else []
         _limits(axes, values, signed=signed, log=log)
-        if beyond:
-            axes.set_title(
-                f"off scale: {', '.join(beyond)}", loc="right", fontsize="small", fontweight="normal", color=INK, pad=2.0
-            )
+        name_off_scale(axes, beyond)
         axes.set_ylabel(f"{name} ({unit})" if len(rows) > 1 else f"{title.lower()} ({unit})")
     panels[0].set_title(title)
     panels[-1].set(xlabel="time (s)", xlim=(0.0, data.duration_s))
     figure.align_ylabels(panels)
     legend(figure, lines)
+
+
+def name_off_scale(axes: Any, beyond: Sequence[str]) -> None:
+    """Name above a panel what leaves it."""
+    if beyond:
+        words = f"off scale: {', '.join(beyond)}"
+        axes.set_title(words, loc="right", fontsize="small", fontweight="normal", color=INK, pad=2.0)
 
 
 def _limits(axes: Any, values: Sequence[Line], *, signed: bool, log: bool) -> None:

@@ -16,6 +16,7 @@ from imutool.recording import Imu
 from imutool.units import AXES, NOUNS, SENSORS, UNITS, Sensor
 from imutool.viewing.html.drawing import Panel, Picture, at_least_three_ticks, decades, legend, plain_tick_labels
 from imutool.viewing.html.page import AXIS_COLORS, INK, SOFT, TITLES
+from imutool.viewing.html.report_errors import LINEAR_RATIO, name_off_scale
 from imutool.viewing.html.report_paths import color_of, style_of
 from imutool.viewing.html.report_wording import best_run, format_number, run_name, worst_orientation_error
 from imutool.viewing.model.decimation import average_log_bins, decimate_extremes
@@ -26,6 +27,7 @@ TAIL = 0.005  # of the samples: spikes may cross into the next run
 SHIFTED = "Each run is drawn below the one before by the step at the right, so that it does not cover it."
 ZOOM_S = 4.0
 SIGMAS = 3.0
+MARGIN = 0.15  # of a panel's height, above and below its curves
 ROUNDING = 1e-7  # of the largest density: below is the rounding of a difference that is constant
 BAND_POINTS = 300
 MIN_REST_S = 4.0  # in one piece, for an Allan deviation
@@ -98,7 +100,7 @@ def spectrum(data: RunData) -> Picture | None:
 def allan_deviation(data: RunData) -> Picture | None:
     """Allan deviations at rest, raw and corrected.
 
-    Nothing where it does not rest for long, or where allantools is not installed (`left_out` says so).
+    Nothing where it does not rest for long or reads a constant, or where allantools is not installed (`missing_pictures`).
     """
     if find_spec("allantools") is None:
         return None
@@ -126,7 +128,10 @@ def allan_deviation(data: RunData) -> Picture | None:
             f"{TITLES[sensor]} Allan deviation",
         )
         for sensor in SENSORS
+        if any(deviation.any() for _, _, deviation in curves[sensor])  # a constant has none
     ]
+    if not panels:
+        return None
     caption = f"Over {format_number(rest_s)} s at rest in {len(ranges)} stretch{'es' * (len(ranges) > 1)}; overlapping."
     caption = " ".join([caption, *(f"{remark[0].upper()}{remark[1:]}." for sensor in SENSORS for remark in remarks[sensor])])
     return Picture("allan", "Allan deviation at rest", caption, tuple(panels))
@@ -187,13 +192,13 @@ def _steps(values: Vectors) -> Values:
 
 def _draw_bias(figure: Any, *, data: RunData, sensor: str) -> None:
     panels = _by_axis(figure, f"{TITLES[sensor]} bias", UNITS[sensor])
-    lines = []
+    lines, bands = [], {}
     for trace in data.models():
         bias = trace.run.gyro_bias if sensor == "gyro" else trace.run.accel_bias
         t, color = data.elapsed_s(trace.run.imu.t_ns), color_of(data, trace)
         if trace.run.bias_std is not None:
             std = trace.run.bias_std[:, :3] if sensor == "gyro" else trace.run.bias_std[:, 3:]
-            _bands(panels, t, bias, SIGMAS * std, color)
+            bands[trace.name] = _bands(panels, t, bias, SIGMAS * std, color)
         drawn = [
             _line(axes, t, bias[:, k], trace.name, k, {"lw": 1.3, **style_of(data, trace)}) for k, axes in enumerate(panels)
         ]
@@ -203,19 +208,32 @@ def _draw_bias(figure: Any, *, data: RunData, sensor: str) -> None:
         t, style = data.elapsed_s(true.t_ns), {"color": INK, "lw": 1.3, "ls": (0, (4, 2))}
         drawn = [_line(axes, t, true.values[:, k], "true", k, style) for k, axes in enumerate(panels)]
         lines.append(drawn[0])
-    for axes in panels:
-        axes.margins(y=0.15)
+    for axis, axes in enumerate(panels):
+        axes.margins(y=MARGIN)
+        _leave_out_wide(axes, {name: edges[axis] for name, edges in bands.items()})
         at_least_three_ticks(axes)
     panels[-1].set(xlabel="time (s)", xlim=(0.0, data.duration_s))
     legend(figure, lines)
 
 
-def _bands(panels: Sequence[Any], t: Values, bias: Vectors, half: Vectors, color: str) -> None:
-    """Three standard deviations about each axis, per pixel from the lowest to the highest."""
+def _bands(panels: Sequence[Any], t: Values, bias: Vectors, half: Vectors, color: str) -> Float64[np.ndarray, "3 2"]:
+    """Three standard deviations about each axis, per pixel from the lowest to the highest; returns the ends by axis."""
     starts = np.unique(np.linspace(0, len(t) - 1, BAND_POINTS).astype(int))
     low, high = np.minimum.reduceat(bias - half, starts), np.maximum.reduceat(bias + half, starts)
     for k, axes in enumerate(panels):
         axes.fill_between(t[starts], low[:, k], high[:, k], color=color, alpha=0.22, lw=0, label=f"±3 σ, {AXES[k]}")
+    return np.stack([low.min(axis=0), high.max(axis=0)], axis=1)
+
+
+def _leave_out_wide(axes: Any, bands: Mapping[str, Values]) -> None:
+    """Limits by the curves and the narrow bands, where a wide one would make them one line."""
+    widths = {name: float(np.ptp(ends)) for name, ends in bands.items()}
+    wide = [name for name, width in widths.items() if width > LINEAR_RATIO * min(widths.values()) > 0.0]
+    if wide:
+        shown = [line.get_ydata() for line in axes.lines] + [ends for name, ends in bands.items() if name not in wide]
+        low, high = np.nanmin(np.concatenate(shown)), np.nanmax(np.concatenate(shown))
+        axes.set_ylim(low - MARGIN * (high - low), high + MARGIN * (high - low))
+    name_off_scale(axes, [f"±3 σ of {name}, {format_number(widths[name])} wide" for name in wide])
 
 
 def _draw_spectrum(

@@ -150,8 +150,8 @@ def summary_of_logs(logs: Sequence[RunData]) -> str:
     better = sum(float(a.figures["aoe_deg"]) < float(b.figures["aoe_deg"]) for a, b in scored)
     new, old = (float(np.median([run.figures["aoe_deg"] for run in side])) for side in zip(*scored, strict=True))
     return (
-        f"In {better} of {len(scored)} logs the best model has a smaller orientation error than raw: "
-        f"{format_quantity(new, '°')} instead of {format_quantity(old, '°')} (medians), without alignment."
+        f"In {better} of {len(scored)} logs the best model has a smaller orientation error than raw. "
+        f"The median is {format_quantity(new, '°')} instead of {format_quantity(old, '°')}, without alignment."
     )
 
 

@@ -98,7 +98,7 @@ def events_within(events: Iterable[Event], start_ns: int, end_ns: int) -> tuple[
         longest = sorted(inside, key=lambda event: event.start_ns - event.end_ns)[:MAX_EVENTS_PER_KIND]
         named = kind.replace("_", " ")
         if len(of_kind) > len(inside):
-            notes.append(f"Events of kind {named}: {len(of_kind) - len(inside)} lie outside the log and are not shown.")
+            notes.append(f"Events of kind {named}: {len(of_kind) - len(inside)} outside the log, not shown.")
         if len(inside) > len(longest):
             notes.append(f"Events of kind {named}: the {len(longest)} longest are shown, {len(inside) - len(longest)} are not.")
         kept += (

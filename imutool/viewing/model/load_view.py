@@ -273,7 +273,7 @@ def provenance(
 ) -> dict[str, str]:
     """Provenance by name: file, topics, settings, models, versions, imutool's metadata records.
 
-    There is no digest of the log, which may have terabytes. Long values are cut, entries beyond MAX_ENTRIES counted.
+    There is no digest of the log, which may have terabytes. Long values of records are cut, entries beyond MAX_ENTRIES counted.
     """
     entries = {"file": log.name, "size": f"{log.stat().st_size} bytes", "IMU": recording.imu_topic}
     if recording.truths:
@@ -287,10 +287,10 @@ def provenance(
         for key, value in values.items()
         if value not in NO_VALUE
     ]
-    entries |= {_cut(f"{name}: {key}"): value for name, key, value in records[:MAX_ENTRIES]}
+    entries |= {_cut(f"{name}: {key}"): _cut(value) for name, key, value in records[:MAX_ENTRIES]}
     if len(records) > MAX_ENTRIES:
         entries["more in the log's records"] = f"{len(records) - MAX_ENTRIES} entries"
-    return {key: _cut(value) for key, value in entries.items()}
+    return entries
 
 
 def _cut(text: str) -> str:

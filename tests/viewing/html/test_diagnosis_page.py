@@ -169,7 +169,7 @@ def test_ten_logs_draw_the_first_four_and_say_so() -> None:
     d = replace(diagnoses.LATE, real=("x.mcap",) * 10, bias=np.zeros((10, 6)), traces=many)
     content = html(d)
     assert len(content.encode()) < MAX_BYTES
-    assert "The first 4 of 10 logs are drawn" in Page(content).text
+    assert "The first 4 of 10 stretches are drawn" in Page(content).text
     assert Page(content).text.count(": over time.") == 4
 
 

@@ -30,9 +30,10 @@ from imutool.viewing.model import decimation
 from imutool.viewing.model.events import Event
 from imutool.viewing.model.load_view import build
 from imutool.viewing.model.run_data import Run, RunData, Trace
-from imutool.viewing.model.trajectory_error import Drift, Errors, Window
+from imutool.viewing.model.trajectory_error import RESET_S, Drift, Errors, Window
 
 Page, svgs, curves = markup.Page, markup.svgs, markup.curves
+APART = 2.0  # points between two curves that are seen as two
 SECONDS, STILL_S = 20.0, 6.0  # of a flight, and of its rest before that
 HOUR = 720_000  # samples at 200 Hz
 MAX_BYTES, MAX_BYTES_OF_AN_HOUR = 1_500_000, 6_000_000
@@ -87,7 +88,7 @@ def panel(data: RunData, make: Callable[[RunData], drawing.Picture | None], whic
     assert picture is not None
     one = picture.panels[which]
     with mock.patch.dict(drawing.STYLE, {"path.simplify": False}):  # else matplotlib leaves out what no pixel would show
-        return drawing.svg(one.draw, one.height_inch, "test", width_inch=drawing.HALF_INCH, label=one.label)
+        return drawing.svg(one.draw, one.height_inch, "test", width_inch=drawing.HALF_INCH)
 
 
 # ── what it says ──
@@ -255,6 +256,16 @@ def test_every_run_has_its_curve_in_every_panel_it_belongs_to(seen: RunData, pag
     assert titles.count("true, y") == 2
     assert titles.count("±3 σ, x") == 2
     assert titles.count("truth") == len([svg for svg in svgs(page) if "Paths:" in svg])
+
+
+def test_a_wide_band_leaves_the_panel_that_its_curves_share(flown: Recording) -> None:
+    bias = np.concatenate([flown.scalars[f"/ground_truth/bias/{kind}"].values[0] for kind in ("gyro", "accel")])
+    for std, named in ((1.0, True), (0.004, False)):
+        runs = [subtract(flown, "sure", bias, std=0.002), subtract(flown, "vague", 0.5 * bias, std=std)]
+        drawn = panel(build(flown, [Run.raw(flown.imu), *runs]), report_signals.biases, 0)
+        assert drawn.count("off scale: ±3 σ of vague, 6.00 wide") == 3 * named
+        sure, vague = (curves(drawn)[name][:, 1].mean() for name in ("sure", "vague"))
+        assert abs(sure - vague) > APART
 
 
 def test_a_sample_near_the_largest_number_is_drawn(seen: RunData, flown: Recording) -> None:
@@ -479,6 +490,7 @@ def test_a_sensor_that_reads_zero_is_drawn(flown: Recording) -> None:
     data = build(dead, [Run.raw(dead.imu)])
     assert not re.search(r"\bnan\b", Page(report.page([data])).text, re.IGNORECASE)
     assert report_signals.spectrum(data) is None  # its panels were empty
+    assert report_signals.allan_deviation(data) is None
 
 
 @pytest.mark.usefixtures("words_alone")
@@ -499,6 +511,15 @@ def test_a_run_that_begins_later_is_at_rest_at_the_same_times(flown: Recording, 
     assert report_signals.allan_deviation(data) is not None
     of_raw, _, of_late, _ = stretches
     np.testing.assert_array_equal(of_late[0], of_raw[0][200:])
+
+
+def test_without_a_reset_the_drift_is_the_error_and_is_not_drawn_twice(flown: Recording) -> None:
+    first_ns = int(flown.imu.t_ns[0])
+    for seconds, drawn in ((RESET_S / 2.0, False), (1.5 * RESET_S, True)):
+        short = flown.between(first_ns, first_ns + round(seconds * 1e9))
+        data = build(short, [Run.raw(short.imu)])
+        assert report_errors.error_curves(data) is not None
+        assert (report_errors.drift_curves(data) is not None) == drawn
 
 
 @pytest.mark.usefixtures("words_alone")
@@ -555,7 +576,7 @@ def test_names_from_anywhere_are_words_and_nothing_else(seen: RunData) -> None:
 
 def test_every_drawing_has_a_name_and_the_pages_own_colours(page: str) -> None:
     for svg in svgs(page):
-        assert re.match(r'<svg role="img" aria-label="[^"]+"', svg)
+        assert re.match(r'<svg role="img" aria-label="[^"]+"', svg.replace(' class="wide"', ""))
         assert not re.findall(r"#[0-9a-fA-F]{6}\b", svg)
         assert set(re.findall(r"var\(--(\w+)\)", svg)) <= LIGHT.keys()
     for name in LIGHT:

@@ -129,7 +129,7 @@ def test_events_end_with_the_log_and_another_century_is_only_counted() -> None:
     kept, notes = events_within(events, 100, 1000)
     assert [(event.start_ns, event.end_ns) for event in kept] == [(100, 150), (500, 500), (900, 1000)]
     assert len(kept[1].text) == MAX_TEXT_LENGTH
-    assert notes == ("Events of kind out of order: 1 lie outside the log and are not shown.",)
+    assert notes == ("Events of kind out of order: 1 outside the log, not shown.",)
 
 
 START_NS, END_NS = 1_700_000_000_000_000_000, 1_700_000_060_000_000_000

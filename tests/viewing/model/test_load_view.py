@@ -311,6 +311,8 @@ def test_a_diagnosis_is_marked_in_its_log(log: Path, tmp_path: Path) -> None:
 
 def test_what_others_wrote_into_a_log_is_bounded(made: Recording, log: Path) -> None:
     hostile = [("imutool<script>", {f"{'k' * 500}{k}": "v" * 10_000 for k in range(1000)}), ("other", {"a": "b"})]
+    how = "hybrid, start: " + "0" * MAX_VALUE_LENGTH  # our own words stay whole
+    assert provenance(log, made, hostile, {"mine": how}, {})["model mine"] == how
     told = provenance(log, made, hostile, {}, {})
     assert len(told) <= MAX_ENTRIES + 10
     assert max(map(len, [*told, *told.values()])) <= MAX_VALUE_LENGTH

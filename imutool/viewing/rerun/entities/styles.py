@@ -19,8 +19,8 @@ GREY: Color = (128, 128, 128)
 TRUTH_COLOR: Color = (150, 150, 150)
 RAW_COLOR: Color = (230, 110, 20)
 # Okabe and Ito's colour-blind safe palette; orange belongs to raw.
-MODEL_COLORS: tuple[Color, ...] = ((30, 140, 230), (0, 158, 115), (204, 121, 167), (190, 160, 0))
-COLOR_NAMES = ("blue", "green", "pink", "yellow")
+MODEL_COLORS: tuple[Color, ...] = ((30, 140, 230), (0, 158, 115), (204, 121, 167), (139, 85, 246))
+COLOR_NAMES = ("blue", "green", "pink", "purple")
 WORST_COLOR: Color = (240, 60, 140)
 EVENT_COLOR: Color = (230, 167, 0)
 BACKGROUND: Color = (24, 26, 30)  # of spatial views, also in a light viewer: the error colours are chosen for it
