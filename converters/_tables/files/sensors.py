@@ -88,10 +88,14 @@ def _pairs(names: Mapping[str, str]) -> dict[str, str]:
     return {n: f"{re.sub(r'^(?=[0-9]|$)', 'imu', rest)}/{s}" for rest, pair in whole.items() for n, s in pair.items()}
 
 
+def names_sensors(text: str) -> tuple[str, int, dict[str, str]] | None:
+    """Delimiter, place of the word in a row by which the rows are of several sensors, and names of gyro and accel."""
+    return _sensor_rows(text[:LOOKED_AT]) or _rows_of_kinds(text[:LOOKED_AT])
+
+
 def read_rows(text: str, columns: Columns, path: Path) -> bool:
     """Add the columns of each sensor of a text whose rows name theirs; False for any other text."""
-    found = _sensor_rows(text[:LOOKED_AT]) or _rows_of_kinds(text[:LOOKED_AT])
-    if found is None:
+    if (found := names_sensors(text)) is None:
         return False
     mark, place, sensors = found
     lines = [line for line in text.splitlines() if line.strip()]

@@ -18,6 +18,7 @@ from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
+from .blocks import AROUND, MAX_LINE, rows_in_blocks, text_of
 from .dates import NO_ZONE, calendar_times, damaged_times, join_dates
 from .header import header_of, note_unused_header, refuse_other_header, units_in_comments, without_numbers_of_columns
 from .names import leaf_of, tells_apart
@@ -26,6 +27,7 @@ from .numbers import (
     DECIMAL_COMMA,
     decimal_points,
     fields_of,
+    has_comma_numbers,
     is_number,
     no_numbers,
     numbers,
@@ -37,15 +39,12 @@ from .numbers import (
 from .packed import UTF16
 
 WIDEST = 64  # columns of a matrix; wider ones are images
-MAX_LINE, TRANSPOSE = 65_536, "Transpose it, if it holds a sample a column"
+TRANSPOSE = "Transpose it, if it holds a sample a column"
 MIN_NUMBERS = 4  # in a row: a time and a vector
 MIN_NAMED = 0.1  # share of the rows that have as many fields as the header, if it is theirs
 LOOKED_AT = 200  # first lines, which show whether text is a table, and its words between the numbers
 FIRSTS = 50  # rows that show what a column without a name counts
-AROUND = "\ufeff \t"  # a header that a program has written again
 COMMENTS = "#", "%", "//"
-FIRST_CHARACTERS = 4096  # of a text, which show how its lines begin
-ARRIVAL = re.compile(r"^(\d\d:\d\d:\d\d\.\d{3}) -> ")  # of Arduino's serial monitor
 STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
     r"\W*(?P<name>[a-z][\w ]{,40}?) *[:=,;\t] *(?P<value>\d{1,9}(\.\d{,15})?) *(?P<unit>k?hz|m?s)?\W*", re.IGNORECASE
 )
@@ -129,31 +128,6 @@ class Columns:
         self.remarks.losses.extend(f"{label}: {loss}" for loss in other.remarks.losses)
 
 
-def text_of(raw: bytes) -> str:
-    """Text in UTF-8, UTF-16 or the code page of Western Windows; lines and minus as in ASCII."""
-    return _with_arrivals(_decoded(raw).replace("\r\n", "\n").replace("\r", "\n").replace("\u2212", "-"))
-
-
-def _decoded(raw: bytes) -> str:
-    if raw.startswith(UTF16):
-        return raw.decode("utf-16", "replace")
-    try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        cut = error.start >= len(raw) - 3  # inside a character
-        return raw.decode("utf-8-sig", "ignore") if cut else raw.decode("cp1252", "replace")
-
-
-def _with_arrivals(text: str) -> str:
-    """Text in which the times before Arduino's rows are fields, `15:04:05.123 -> 0.1,0.2`; any other text as it is."""
-    rows = [row for line in text[:FIRST_CHARACTERS].splitlines() if (row := ARRIVAL.sub("", line)) != line]
-    if len(rows) <= text[:FIRST_CHARACTERS].count("\n") / 2:
-        return text
-    mark = max(";\t, ", key=lambda each: sum(each in row for row in rows))
-    named = re.sub(rf"{ARRIVAL.pattern}(?=\D*$)", f"arrival{mark}", text, flags=re.MULTILINE)  # a board's own time counts first
-    return re.sub(ARRIVAL.pattern, rf"\1{mark}", named, flags=re.MULTILINE)
-
-
 def is_text_table(head: bytes, minimum: int = MIN_NUMBERS) -> bool:
     """Whether text has a row of at least so many numbers."""
     if b"\0" in head and not head.startswith(UTF16):
@@ -194,31 +168,71 @@ def read_csv(text: str, columns: Columns, path: Path, minimum: int = MIN_NUMBERS
     Raises:
         DataError: a line is too long for a table.
     """
+    above, rows, delimiter = _cut(text, path, minimum)
+    header = {line.strip(AROUND) for line in above}
+    kept = [line for line in rows if line.strip(AROUND) not in header]
+    if repeated := len(rows) - len(kept):  # as of files that were joined
+        columns.remarks.notes.append(f"{repeated} lines that repeat the header are left out")
+    body, grouped = without_thousands(kept, delimiter)
+    values, fields, width = _columns_of(body, above, delimiter, columns)
+    refuse_other_header(fields, path)
+    named = _named(above, kept[:FIRSTS], delimiter, width, grouped, columns)
+    _add_columns(columns, *named, values, fields, COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA)
+
+
+def read_plain(path: Path, start: str, columns: Columns) -> bool:
+    """Add the columns of a file that begins with `start`, in blocks; False where its rows are not all plain.
+
+    They are plain if they are ASCII, and `plain_columns` reads them. Of the whole text `read_csv` makes the same columns.
+    """
+    above, rows, delimiter = _cut(start, path, MIN_NUMBERS)
+    if len(rows) < LOOKED_AT or has_comma_numbers(rows, delimiter):
+        return False
+    header = {line.strip(AROUND) for line in above}
+    plain = plain_columns(lambda: rows_in_blocks(path, rows, header), delimiter)
+    if plain is None:
+        return False
+    named = _named(above, rows[:FIRSTS], delimiter, len(plain[0]), [], columns)
+    _add_columns(columns, *named, *plain, COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA)
+    return True
+
+
+def _cut(text: str, path: Path, minimum: int) -> tuple[list[str], list[str], str | None]:
+    """Lines above the rows of a table, the rows, and their delimiter."""
     lines = [line for line in text.splitlines() if line.strip()]
     if any(len(line) > MAX_LINE for line in lines):
         raise DataError("has a line of more than 65 536 characters", where=path, expected="a sample a row", fix=TRANSPOSE)
     lines = without_numbers_of_columns(lines, delimiter := _delimiter(lines, minimum))
     first = next((n for n, line in enumerate(lines) if _is_row(line, delimiter, minimum)), len(lines))
-    several = (
-        part for line in lines[:first] if line.startswith(COMMENTS) for part in re.split(r", |: (?=.*=)| (?=\w+=\S)", line)
-    )
-    stated = filter(None, map(STATED_NUMBER.fullmatch, [*lines[:first], *several]))
+    return lines[:first], lines[first:], delimiter
+
+
+def _named(
+    above: list[str], rows: list[str], delimiter: str | None, width: int, grouped: list[int], columns: Columns
+) -> tuple[list[str], dict[str, str]]:
+    """Names of the columns and their units; what else the lines above them state goes into `columns`."""
+    several = (part for line in above if line.startswith(COMMENTS) for part in re.split(r", |: (?=.*=)| (?=\w+=\S)", line))
+    stated = filter(None, map(STATED_NUMBER.fullmatch, [*above, *several]))
     columns.numbers |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in stated}
-    above = {line.strip(AROUND) for line in lines[:first]}
-    kept = lines[:first] + [line for line in lines[first:] if line.strip(AROUND) not in above]
-    if repeated := len(lines) - len(kept):  # as of files that were joined
-        lines = kept
-        columns.remarks.notes.append(f"{repeated} lines that repeat the header are left out")
-    body, grouped = without_thousands(lines[first:], delimiter)
-    values, fields, width = _columns_of(body, lines[:first], delimiter, columns)
-    refuse_other_header(fields, path)
-    firsts = [row[0].strip().strip('"') for row in fields_of(lines[first : first + FIRSTS], delimiter) if len(row) == width]
-    names, units = header_of(lines[:first], delimiter, width, firsts)
+    firsts = [row[0].strip().strip('"') for row in fields_of(rows, delimiter) if len(row) == width]
+    names, units = header_of(above, delimiter, width, firsts)
     columns.remarks.notes.extend([f"points mark thousands: {', '.join(names[k] for k in grouped)}"] if grouped else [])
-    note_unused_header(lines[:first], delimiter, names, columns.remarks)
-    for unit, of in units_in_comments((line for line in lines[:first] if line.startswith(COMMENTS)), names).items():
+    note_unused_header(above, delimiter, names, columns.remarks)
+    for unit, of in units_in_comments((line for line in above if line.startswith(COMMENTS)), names).items():
         units |= dict.fromkeys(of, unit)
         columns.remarks.notes.append(f"{', '.join(of)} in {unit}, by a comment above the table")
+    return names, units
+
+
+def _add_columns(
+    columns: Columns,
+    names: list[str],
+    units: dict[str, str],
+    values: list[np.ndarray | None],
+    fields: list[list[str]],
+    comma: re.Pattern[str],
+) -> None:
+    """Add columns of numbers, and of texts what they hold; `comma` matches a number with a decimal comma."""
     commas, empty = list[str](), list[str]()
     if (joined := join_dates(names, fields)) is not None:
         del values[joined]
@@ -231,7 +245,7 @@ def read_csv(text: str, columns: Columns, path: Path, minimum: int = MIN_NUMBERS
         if not any(texts):
             empty.append(named)
             continue
-        if pointed := decimal_points(texts, COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA):
+        if pointed := decimal_points(texts, comma):
             texts[:] = pointed
             commas.append(name)
         add_fields(columns, name, texts, units.get(name, ""))
@@ -244,7 +258,7 @@ def _columns_of(
     lines: list[str], above: list[str], delimiter: str | None, columns: Columns
 ) -> tuple[list[np.ndarray | None], list[list[str]], int]:
     """Numbers of columns that are read as such, texts of the others, and how many columns there are."""
-    if (plain := plain_columns(lines, delimiter)) is not None:
+    if (plain := plain_columns(lambda: [lines], delimiter)) is not None:
         return *plain, len(plain[0])
     rows = fields_of(lines, delimiter)
     ends = {len(row) for row in fields_of(above, delimiter) if row and row[-1].strip()}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Callable, Iterable
+from itertools import chain, islice
 
 import numpy as np
 
@@ -17,40 +19,66 @@ MAX_BACK = 0.25  # share of the steps of a time that go back
 MAX_ODD = 0.1  # share of the fields of a column of numbers that are none: `-`, `ERR`, a garbled line
 
 
-def plain_columns(lines: list[str], delimiter: str | None) -> tuple[list[np.ndarray | None], list[list[str]]] | None:
-    """Numbers and texts of columns, of lines of equally many fields; None of other lines.
+def plain_columns(
+    blocks: Callable[[], Iterable[list[str]]], delimiter: str | None
+) -> tuple[list[np.ndarray | None], list[list[str]]] | None:
+    """Numbers and texts of columns, of blocks of lines of equally many fields; None of other lines.
 
     A field may have quotes, with no delimiter in them. A column is all of numbers, and has its texts only if it may be a time
-    that float64 rounds, or is all of texts. NumPy takes a tenth of the time and memory of Python's fields.
+    that float64 rounds, or is all of texts. NumPy takes a tenth of the time and memory of Python's fields. A block that cannot
+    be read raises a ValueError.
     """
-    if any('"' in line for line in lines):
-        if any(_count(part, delimiter) > 1 for line in lines for part in line.split('"')[1::2]):
-            return None
-        lines = [line.replace('"', "") for line in lines]
-    looked = [line.split(delimiter) for line in [*lines[:SAMPLED], *lines[-1:]]]
-    width = len(looked[0]) if looked else 0
-    if not width or any(_count(line, delimiter) != width for line in lines) or not any(row[-1] for row in looked):
-        return None
-    fields = [[text.strip() for text in column] for column in zip(*looked, strict=True)]
-    kinds = {
-        str(k): np.int64 if all(map(WHOLE_NUMBER.fullmatch, texts)) else np.float64
-        for k, texts in enumerate(fields)
-        if None not in map(_number, texts)
-    }
-    if not kinds:
-        return None
+    looked, width, count, kinds, parts = list[str](), 0, 0, dict[str, type](), dict[str, list[np.ndarray]]()
     try:
-        used = [int(k) for k in kinds]
-        rows = np.loadtxt(lines, [*kinds.items()], comments=None, delimiter=delimiter, usecols=used, ndmin=1)
+        for lines in (_without_quotes(block, delimiter) for block in blocks()):
+            if not width:
+                looked, width = lines[:SAMPLED], _count(lines[0], delimiter) if lines else 0
+            if not width or any(_count(line, delimiter) != width for line in lines):
+                return None
+            if not (kinds := kinds or _kinds([*looked, lines[-1]], delimiter)):
+                return None
+            used = [int(k) for k in kinds]
+            read = np.loadtxt(lines, [*kinds.items()], comments=None, delimiter=delimiter, usecols=used, ndmin=1)
+            for k in kinds:
+                parts.setdefault(k, []).append(np.ascontiguousarray(read[k]))
+            count += len(read)
+            del read
+        if not kinds or _kinds([*looked, lines[-1]], delimiter) != kinds:
+            return None
+        values = [np.concatenate(parts.pop(str(k))) if str(k) in kinds else None for k in range(width)]
+        kept = [k for k, column in enumerate(values) if column is None or _is_rounded_time(column)]
+        every = (_without_quotes(block, delimiter) for block in (blocks() if kept else ()))
+        texts: list[list[str]] = [[] for _ in values]
+        for row in (line.split(delimiter, max(kept) + 1) for line in islice(chain.from_iterable(every), count)):
+            for k in kept:
+                texts[k].append(row[k].strip())
     except (ValueError, OverflowError):
         return None
-    values = [np.ascontiguousarray(rows[str(k)]) if str(k) in kinds else None for k in range(width)]
-    texts: list[list[str]] = [[] for _ in values]
-    kept = [k for k, column in enumerate(values) if column is None or _is_rounded_time(column)]
-    for parts in (line.split(delimiter, max(kept) + 1) for line in lines if kept):
-        for k in kept:
-            texts[k].append(parts[k].strip())
-    return values, texts
+    return (values, texts) if all(len(texts[k]) == count for k in kept) else None
+
+
+def _without_quotes(lines: list[str], delimiter: str | None) -> list[str]:
+    """Lines without the quotes around fields.
+
+    Raises:
+        ValueError: a delimiter stands in quotes.
+    """
+    if not any('"' in line for line in lines):
+        return lines
+    if any(_count(part, delimiter) > 1 for line in lines for part in line.split('"')[1::2]):
+        raise ValueError("a delimiter in quotes")
+    return [line.replace('"', "") for line in lines]
+
+
+def _kinds(lines: list[str], delimiter: str | None) -> dict[str, type]:
+    """Types of the columns of numbers, by their places; none where the last field of each line is blank."""
+    rows = [line.split(delimiter) for line in lines]
+    fields = [[text.strip() for text in column] for column in zip(*rows, strict=True)]
+    return {
+        str(k): np.int64 if all(map(WHOLE_NUMBER.fullmatch, texts)) else np.float64
+        for k, texts in enumerate(fields if any(row[-1] for row in rows) else [])
+        if None not in map(_number, texts)
+    }
 
 
 def _is_rounded_time(column: np.ndarray) -> bool:
@@ -97,11 +125,15 @@ def decimal_points(texts: list[str], mark: re.Pattern[str]) -> list[str]:
     return [text.replace(",", ".") for text in texts] if has_one else []
 
 
+def has_comma_numbers(lines: list[str], delimiter: str | None) -> bool:
+    """Whether a field of the first lines is a number with a decimal comma, between other delimiters."""
+    fields = (text for row in fields_of(lines[:SAMPLED], delimiter) for text in row)
+    return delimiter != "," and any(map(COMMA_NUMBER.fullmatch, fields))
+
+
 def without_thousands(lines: list[str], delimiter: str | None) -> tuple[list[str], list[int]]:
     """Rows without points that mark thousands, and the places of their columns."""
-    if delimiter == "," or not any(
-        COMMA_NUMBER.fullmatch(text) for row in fields_of(lines[:SAMPLED], delimiter) for text in row
-    ):
+    if not has_comma_numbers(lines, delimiter):
         return lines, []
     rows = [[text.strip().strip('"') for text in row] for row in fields_of(lines, delimiter)]
     width = len(rows[0])
