@@ -204,8 +204,12 @@ def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
     """IMU of a map, on the gyro's stamps."""
     gyro_ns = times_named(columns, table.time, table.time_unit, place)
     accel_ns = times_named(columns, table.accel_time, table.time_unit, place) if table.accel_time else gyro_ns
-    gyro = vectors_named(columns, table.gyro, table.gyro_scale, table.gyro_offset, place) * GYRO_SI[table.gyro_unit]
-    accel = vectors_named(columns, table.accel, table.accel_scale, table.accel_offset, place) * ACCEL_SI[table.accel_unit]
+    gyro = vectors_named(columns, table.gyro, table.gyro_scale, table.gyro_offset, place)
+    accel = vectors_named(columns, table.accel, table.accel_scale, table.accel_offset, place)
+    gyro *= GYRO_SI[table.gyro_unit]
+    accel *= ACCEL_SI[table.accel_unit]
+    for each in (gyro_ns, gyro, accel):
+        each.flags.writeable = False  # so that the IMU needs no copy
     for label, t_ns, values in (("gyro", gyro_ns, gyro), ("accel", accel_ns, accel)):
         if len(t_ns) != len(values):
             fix = "Name its times as `accel_time`" if label == "accel" and not table.accel_time else ""

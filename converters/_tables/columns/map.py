@@ -295,6 +295,8 @@ def vectors_named(
     signs = np.array([1.0 if name in columns.values else -1.0 for name in wanted])
     if len({len(column_named(columns, columns.unsigned(name), where)) for name in wanted}) > 1:
         raise ConfigError(f"{', '.join(wanted)} have different numbers of rows", where=where)
-    unsigned = columns.side_by_side(columns.unsigned(name) for name in wanted)
-    values: Float64[np.ndarray, "n k"] = (unsigned - np.asarray(offset)) * np.asarray(scale) * signs
+    values = columns.side_by_side(columns.unsigned(name) for name in wanted)
+    values -= np.asarray(offset)
+    values *= np.asarray(scale)
+    values *= signs
     return values

@@ -111,8 +111,8 @@ class Columns:
 
     def side_by_side(self, names: Iterable[str]) -> Float64[np.ndarray, "n k"]:
         """Columns as one array; one named with a minus counts the other way."""
-        signed = ((1.0 if name in self.values else -1.0, self.unsigned(name)) for name in names)
-        return np.stack([sign * self.values[name].astype(float) for sign, name in signed], axis=1)
+        columns = ((name in self.values, self.values[self.unsigned(name)].astype(float, copy=False)) for name in names)
+        return np.stack([values if is_plain else -1.0 * values for is_plain, values in columns], axis=1)
 
     def take(self, group: str, other: Columns, label: str) -> None:
         """Take in the columns and remarks of another table as a group."""
