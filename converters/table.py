@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -88,15 +89,18 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
     for each in (each for each in tables if each.rate_hz):
         refuse_joined(columns, columns.unsigned(each.gyro[0]), place)
     table = tables[0]  # other columns are on its clock
-    imus = {each.topic: _imu(columns, each, place) for each in tables}
-    used = {c for each in tables for c in (each.time, each.counter, each.accel_time, *each.gyro, *each.accel)}
+    turns = *table.quaternion_wxyz, *table.roll_pitch_yaw, *matrix_columns(table.rotation_matrix)
+    true = {table.truth_time, *table.position, *turns}
+    samples = {c for each in tables for c in (*each.gyro, *each.accel)}
+    used = samples | {c for each in tables for c in (each.time, each.counter, each.accel_time)}
+    columns = replace(columns, values={**columns.values})
+    imus = {each.topic: _imu(columns, each, place, samples - true if each is tables[-1] else set()) for each in tables}
     poses = _truth(columns, table, path, place, remarks, imus[table.topic])
     group = next((g for g in (POSES_GROUP, TRUTH_GROUP) if g in columns.sources), "") if path.is_dir() else ""
     if not poses and (group or "pose_kind" in given):
         remarks.losses.append(f"{columns.sources.get(group, path.name)} gives no poses: {why_no_poses(columns, group)}")
     if poses and not table.truth_file:
-        turns = *table.quaternion_wxyz, *table.roll_pitch_yaw, *matrix_columns(table.rotation_matrix)
-        used |= {table.truth_time, *table.position, *turns}
+        used |= true
     scalars, constants = _further(columns, tables, {column.removeprefix("-") for column in used}, place)
     remarks.losses.extend(sequence.losses)
     log = MessageLog(
@@ -200,8 +204,8 @@ def _clocked(columns: Columns, table: TableMap, place: Path) -> TableMap:
     return msgspec.structs.replace(table, **pose_clock(columns, msgspec.structs.asdict(table)))
 
 
-def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
-    """IMU of a map, on the gyro's stamps."""
+def _imu(columns: Columns, table: TableMap, place: Path, spent: set[str]) -> Imu:
+    """IMU of a map, on the gyro's stamps; of the columns that are `spent` the values are let go."""
     gyro_ns = times_named(columns, table.time, table.time_unit, place)
     accel_ns = times_named(columns, table.accel_time, table.time_unit, place) if table.accel_time else gyro_ns
     gyro = vectors_named(columns, table.gyro, table.gyro_scale, table.gyro_offset, place)
@@ -210,6 +214,8 @@ def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
     accel *= ACCEL_SI[table.accel_unit]
     for each in (gyro_ns, gyro, accel):
         each.flags.writeable = False  # so that the IMU needs no copy
+    for column in map(columns.unsigned, spent):
+        columns.values[column] = np.broadcast_to(0.0, len(columns.values[column]))
     for label, t_ns, values in (("gyro", gyro_ns, gyro), ("accel", accel_ns, accel)):
         if len(t_ns) != len(values):
             fix = "Name its times as `accel_time`" if label == "accel" and not table.accel_time else ""

@@ -146,7 +146,7 @@ def _together(
     rate = _resampled(gyro_ns, gyro, start, first, last)
     if count * STEP_S > MAX_S:
         window = round(MAX_S / STEP_S)
-        turned = np.concatenate([[0.0], np.cumsum((rate**2).sum(axis=1))])
+        turned = np.concatenate([[0.0], np.cumsum(rate[:, 0] ** 2 + rate[:, 1] ** 2 + rate[:, 2] ** 2)])
         first = int(np.argmax(turned[window:] - turned[:-window]))
         last = first + window
         rate = rate[first:last].copy()
