@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Int64
 from imutool.errors import ConfigError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses, Scalars, unit_quaternions
@@ -45,9 +45,9 @@ from ._tables.columns.map import (
 from ._tables.columns.motion import settle_accel_unit
 from ._tables.columns.pose_names import why_no_poses
 from ._tables.columns.propose import propose, without_copies
-from ._tables.columns.rotations import known_rotations, of_matrices, unit_by_poses
+from ._tables.columns.rotations import known_rotations, rotations_named, unit_by_poses
 from ._tables.columns.times import COUNTED, begun_at_zero, count_times
-from ._tables.columns.units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
+from ._tables.columns.units import ACCEL_SI, GYRO_SI, POSITION_SI, unit_doubts
 from ._tables.files.formats import kind_of, load
 from ._tables.files.layouts import known_layout
 from ._tables.recordings.folder import load_split, sequences_below
@@ -239,7 +239,7 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
             raise ConfigError(f"truth_file {table.truth_file!r} does not exist", where=where)
         columns = load(other, kind_of(head(other), other))
     t_ns = times_named(columns, table.truth_time or table.time, table.truth_time_unit or table.time_unit, where)
-    q_wxyz = _rotations(columns, table, where)
+    q_wxyz = rotations_named(columns, table, where)
     p = np.zeros((len(q_wxyz), 3))
     if table.position:
         p = vectors_named(columns, table.position, POSITION_SI[table.position_unit], 0.0, where)
@@ -260,17 +260,6 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
     if not table.position:
         remarks.notes.append("the poses have no positions: zeros stand for them, and nothing is compared with them")
     return {topic: Poses(kept.t_ns, kept.values[:, :3], unit_quaternions(kept.values[:, 3:]))}
-
-
-def _rotations(columns: Columns, table: TableMap, where: Path) -> Float64[np.ndarray, "n 4"]:
-    """Quaternions (wxyz) of the columns that the map names for the poses."""
-    if table.quaternion_wxyz:
-        return vectors_named(columns, table.quaternion_wxyz, 1.0, 0.0, where)
-    if table.roll_pitch_yaw:
-        angles = vectors_named(columns, table.roll_pitch_yaw, ANGLE_SI[table.roll_pitch_yaw_unit], 0.0, where)
-        return quaternion.of_roll_pitch_yaw(angles)
-    nine = matrix_columns(table.rotation_matrix)
-    return of_matrices(vectors_named(columns, nine, 1.0, 0.0, where).reshape(-1, 3, 3), where)
 
 
 def _further(

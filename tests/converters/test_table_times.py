@@ -70,7 +70,7 @@ def test_the_gyro_of_a_phones_folder_is_in_the_unit_of_its_header_or_by_which_gr
 def test_quotes_that_hold_a_delimiter_leave_the_row_to_the_reader_of_quotes():
     """Behind the first rows, in a row that lacks a field, too."""
     rows = [f'{t},"ok",{value}' for t, value in enumerate(GYRO[:300, 0].tolist())]
-    assert plain_columns(rows, ",") is not None
+    assert plain_columns(lambda: [rows], ",") is not None
     assert plain_columns([*rows[:250], '250,"lost, again"', *rows[251:]], ",") is None
 
 

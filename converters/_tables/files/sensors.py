@@ -16,7 +16,8 @@ import numpy as np
 
 from ..columns.headerless import name_headerless
 from ..columns.times import in_batches, rises
-from ..text.delimited import COMMENTS, Columns, read_csv
+from ..text.delimited import Columns, read_csv
+from ..text.header import COMMENTS
 from ..text.names import UNITS, is_of_recordings, split_name
 from ..text.numbers import is_number
 

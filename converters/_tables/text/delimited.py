@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from imutool.recording.message_log import Remarks
 
 from .blocks import AROUND, MAX_LINE, rows_in_blocks, text_of
 from .dates import NO_ZONE, calendar_times, damaged_times, join_dates
-from .header import header_of, note_unused_header, refuse_other_header, units_in_comments, without_numbers_of_columns
+from .header import COMMENTS, read_header, refuse_other_header, without_numbers_of_columns
 from .names import leaf_of, tells_apart
 from .numbers import (
     COMMA_NUMBER,
@@ -44,10 +44,6 @@ MIN_NUMBERS = 4  # in a row: a time and a vector
 MIN_NAMED = 0.1  # share of the rows that have as many fields as the header, if it is theirs
 LOOKED_AT = 200  # first lines, which show whether text is a table, and its words between the numbers
 FIRSTS = 50  # rows that show what a column without a name counts
-COMMENTS = "#", "%", "//"
-STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
-    r"\W*(?P<name>[a-z][\w ]{,40}?) *[:=,;\t] *(?P<value>\d{1,9}(\.\d{,15})?) *(?P<unit>k?hz|m?s)?\W*", re.IGNORECASE
-)
 
 
 def matrix_columns(named: str | list[str]) -> list[str]:
@@ -62,7 +58,7 @@ class Columns:
     values: dict[str, np.ndarray] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     numbers: dict[str, float] = field(default_factory=dict)
-    texts: dict[str, list[str]] = field(default_factory=dict)
+    texts: dict[str, Sequence[str]] = field(default_factory=dict)
     labels: dict[str, list[str]] = field(default_factory=dict)  # texts of columns that tell recordings or sensors apart
     remarks: Remarks = field(default_factory=Remarks)
     sources: dict[str, str] = field(default_factory=dict)
@@ -99,10 +95,11 @@ class Columns:
         elif array.size == 1:
             self.numbers[name] = float(array.reshape(-1)[0])
 
-    def add_labels(self, name: str, texts: list[str]) -> None:
+    def add_labels(self, name: str, texts: Sequence[str]) -> None:
         """Take in the texts of a column, which are lost unless they tell recordings or sensors apart."""
         if tells_apart(leaf_of(name)):
-            self.labels[name] = texts
+            seen: dict[str, str] = {}
+            self.labels[name] = [seen.setdefault(text, text) for text in texts]  # a few labels, each in memory once
         self.remarks.losses.append(no_numbers(name, texts))
 
     def unsigned(self, name: str) -> str:
@@ -176,7 +173,7 @@ def read_csv(text: str, columns: Columns, path: Path, minimum: int = MIN_NUMBERS
     body, grouped = without_thousands(kept, delimiter)
     values, fields, width = _columns_of(body, above, delimiter, columns)
     refuse_other_header(fields, path)
-    named = _named(above, kept[:FIRSTS], delimiter, width, grouped, columns)
+    named = read_header(above, kept[:FIRSTS], delimiter, width, grouped, columns.numbers, columns.remarks)
     _add_columns(columns, *named, values, fields, COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA)
 
 
@@ -192,7 +189,7 @@ def read_plain(path: Path, start: str, columns: Columns) -> bool:
     plain = plain_columns(lambda: rows_in_blocks(path, rows, header), delimiter)
     if plain is None:
         return False
-    named = _named(above, rows[:FIRSTS], delimiter, len(plain[0]), [], columns)
+    named = read_header(above, rows[:FIRSTS], delimiter, len(plain[0]), [], columns.numbers, columns.remarks)
     _add_columns(columns, *named, *plain, COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA)
     return True
 
@@ -207,29 +204,12 @@ def _cut(text: str, path: Path, minimum: int) -> tuple[list[str], list[str], str
     return lines[:first], lines[first:], delimiter
 
 
-def _named(
-    above: list[str], rows: list[str], delimiter: str | None, width: int, grouped: list[int], columns: Columns
-) -> tuple[list[str], dict[str, str]]:
-    """Names of the columns and their units; what else the lines above them state goes into `columns`."""
-    several = (part for line in above if line.startswith(COMMENTS) for part in re.split(r", |: (?=.*=)| (?=\w+=\S)", line))
-    stated = filter(None, map(STATED_NUMBER.fullmatch, [*above, *several]))
-    columns.numbers |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in stated}
-    firsts = [row[0].strip().strip('"') for row in fields_of(rows, delimiter) if len(row) == width]
-    names, units = header_of(above, delimiter, width, firsts)
-    columns.remarks.notes.extend([f"points mark thousands: {', '.join(names[k] for k in grouped)}"] if grouped else [])
-    note_unused_header(above, delimiter, names, columns.remarks)
-    for unit, of in units_in_comments((line for line in above if line.startswith(COMMENTS)), names).items():
-        units |= dict.fromkeys(of, unit)
-        columns.remarks.notes.append(f"{', '.join(of)} in {unit}, by a comment above the table")
-    return names, units
-
-
 def _add_columns(
     columns: Columns,
     names: list[str],
     units: dict[str, str],
     values: list[np.ndarray | None],
-    fields: list[list[str]],
+    fields: list[Sequence[str]],
     comma: re.Pattern[str],
 ) -> None:
     """Add columns of numbers, and of texts what they hold; `comma` matches a number with a decimal comma."""
@@ -246,9 +226,8 @@ def _add_columns(
             empty.append(named)
             continue
         if pointed := decimal_points(texts, comma):
-            texts[:] = pointed
             commas.append(name)
-        add_fields(columns, name, texts, units.get(name, ""))
+        add_fields(columns, name, pointed or texts, units.get(name, ""))
     if unread := ", ".join(filter(None, empty)):
         columns.remarks.notes.append(f"columns without a value are left out: {unread}")
     columns.remarks.notes.extend([f"decimal commas are read as points: {', '.join(commas)}"] if commas else [])
@@ -256,7 +235,7 @@ def _add_columns(
 
 def _columns_of(
     lines: list[str], above: list[str], delimiter: str | None, columns: Columns
-) -> tuple[list[np.ndarray | None], list[list[str]], int]:
+) -> tuple[list[np.ndarray | None], list[Sequence[str]], int]:
     """Numbers of columns that are read as such, texts of the others, and how many columns there are."""
     if (plain := plain_columns(lambda: [lines], delimiter)) is not None:
         return *plain, len(plain[0])
@@ -271,11 +250,11 @@ def _columns_of(
         columns.remarks.notes.append(f"{words} lines of words between the rows are left out")
     if len(others) > words:
         columns.remarks.losses.append(f"{len(others) - words} rows do not have {width} fields and are left out")
-    fields = [[text.strip().strip('"') for text in column] for column in zip(*whole, strict=True)]
+    fields: list[Sequence[str]] = [[text.strip().strip('"') for text in column] for column in zip(*whole, strict=True)]
     return [None] * len(fields), fields, width
 
 
-def add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> None:
+def add_fields(columns: Columns, name: str, texts: Sequence[str], unit: str) -> None:
     """Add a column of texts as numbers, vectors or times, or say what it is instead."""
     if (rows := vectors(texts)) is not None:
         columns.add(name, rows, unit)

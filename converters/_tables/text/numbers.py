@@ -5,9 +5,9 @@ from __future__ import annotations
 import csv
 import re
 from array import array
-from collections.abc import Callable, Iterable
-from itertools import chain, islice
-from typing import Any
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, overload
 
 import numpy as np
 
@@ -21,9 +21,39 @@ MAX_BACK = 0.25  # share of the steps of a time that go back
 MAX_ODD = 0.1  # share of the fields of a column of numbers that are none: `-`, `ERR`, a garbled line
 
 
+class Texts(Sequence[str]):
+    """Texts of a column without line breaks; a list of them takes fifty bytes more for each."""
+
+    def __init__(self) -> None:
+        self._blocks: list[str] = []
+        self._starts = [0]  # rows in which the blocks begin, and the end
+
+    def add(self, texts: list[str]) -> None:
+        """Take in the texts of further rows."""
+        if texts:
+            self._blocks.append("\n".join(texts))
+            self._starts.append(self._starts[-1] + len(texts))
+
+    def __len__(self) -> int:
+        return self._starts[-1]
+
+    def __iter__(self) -> Iterator[str]:
+        return (text for block in self._blocks for text in block.split("\n"))
+
+    @overload
+    def __getitem__(self, row: int) -> str: ...
+    @overload
+    def __getitem__(self, row: slice) -> list[str]: ...
+    def __getitem__(self, row: int | slice) -> str | list[str]:
+        if isinstance(row, slice):
+            return [*self][row]
+        block = bisect_right(self._starts, row) - 1
+        return self._blocks[block].split("\n")[row - self._starts[block]]
+
+
 def plain_columns(
     blocks: Callable[[], Iterable[list[str]]], delimiter: str | None
-) -> tuple[list[np.ndarray | None], list[list[str]]] | None:
+) -> tuple[list[np.ndarray | None], list[Sequence[str]]] | None:
     """Numbers and texts of columns, of blocks of lines of equally many fields; None of other lines.
 
     A field may have quotes, with no delimiter in them. A column is all of numbers, and has its texts only if it may be a time
@@ -48,16 +78,18 @@ def plain_columns(
             del read
         if not kinds or _kinds([*looked, lines[-1]], delimiter) != kinds:
             return None
-        values = [np.frombuffer(parts[str(k)], kinds[str(k)]) if str(k) in kinds else None for k in range(width)]
+        read_as = ((k, kinds.get(str(k))) for k in range(width))
+        values: list[np.ndarray | None] = [None if kind is None else np.frombuffer(parts[str(k)], kind) for k, kind in read_as]
         kept = [k for k, column in enumerate(values) if column is None or _is_rounded_time(column)]
-        every = (_without_quotes(block, delimiter) for block in (blocks() if kept else ()))
-        texts: list[list[str]] = [[] for _ in values]
-        for row in (line.split(delimiter, max(kept) + 1) for line in islice(chain.from_iterable(every), count)):
-            for k in kept:
-                texts[k].append(row[k].strip())
+        texts = [Texts() for _ in values]
+        for lines in (_without_quotes(block, delimiter) for block in (blocks() if kept else ())):
+            left = count - len(texts[kept[0]])  # the file may have grown
+            rows = [line.split(delimiter, max(kept) + 1) for line in lines[:left]]
+            for place in kept:
+                texts[place].add([row[place].strip() for row in rows])
     except (ValueError, OverflowError):
         return None
-    return (values, texts) if all(len(texts[k]) == count for k in kept) else None
+    return (values, [*texts]) if all(len(texts[k]) == count for k in kept) else None
 
 
 def _without_quotes(lines: list[str], delimiter: str | None) -> list[str]:
@@ -114,7 +146,7 @@ def vector(text: str) -> list[str]:
     return fields if len(fields) > 1 and all(_number(field) is not None for field in fields) else []
 
 
-def vectors(texts: list[str]) -> np.ndarray | None:
+def vectors(texts: Sequence[str]) -> np.ndarray | None:
     """Vectors of a column; None of other texts, or of several lengths."""
     if not vector(texts[0]):
         return None
@@ -122,7 +154,7 @@ def vectors(texts: list[str]) -> np.ndarray | None:
     return np.array(found).astype(np.float64) if len({*map(len, found)}) == 1 else None
 
 
-def decimal_points(texts: list[str], mark: re.Pattern[str]) -> list[str]:
+def decimal_points(texts: Sequence[str], mark: re.Pattern[str]) -> list[str]:
     """Fields with points for their decimal commas; none where no field has one."""
     has_one = "," in "".join(texts) and any("," in text and mark.fullmatch(text) for text in texts)
     return [text.replace(",", ".") for text in texts] if has_one else []
@@ -150,12 +182,12 @@ def without_thousands(lines: list[str], delimiter: str | None) -> tuple[list[str
     return [(delimiter or " ").join(row) for row in rows] if grouped else lines, grouped
 
 
-def numbers(texts: list[str]) -> tuple[np.ndarray, list[str]] | None:
+def numbers(texts: Sequence[str]) -> tuple[np.ndarray, list[str]] | None:
     """Numbers of a column, nan for the few fields that are none, and these; None of texts."""
     if "_" not in "".join(texts):
         for kind in (int, float):
             try:
-                return np.array(list(map(kind, texts)), np.int64 if kind is int else np.float64), []
+                return np.fromiter(map(kind, texts), np.int64 if kind is int else np.float64, len(texts)), []
             except (ValueError, OverflowError):
                 pass
     found = [_number(text) for text in texts]
@@ -173,7 +205,7 @@ def _number(text: str) -> float | None:
         return None
 
 
-def no_numbers(name: str, texts: list[str]) -> str:
+def no_numbers(name: str, texts: Sequence[str]) -> str:
     """Sentence on a column of texts, which is left out."""
     wrong = next((text for text in texts if text and not is_number(text)), texts[0])
     return f"{name} is left out: its fields, as {wrong[:40]!r}, are no numbers"
