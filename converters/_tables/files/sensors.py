@@ -90,7 +90,7 @@ def _pairs(names: Mapping[str, str]) -> dict[str, str]:
 
 
 def names_sensors(text: str) -> tuple[str, int, dict[str, str]] | None:
-    """Delimiter, place of the word in a row by which the rows are of several sensors, and names of gyro and accel."""
+    """Delimiter, place of a row's sensor in it, and names of gyro and accel; None of other text."""
     return _sensor_rows(text[:LOOKED_AT]) or _rows_of_kinds(text[:LOOKED_AT])
 
 

@@ -178,9 +178,9 @@ def read_csv(text: str, columns: Columns, path: Path, minimum: int = MIN_NUMBERS
 
 
 def read_plain(path: Path, start: str, columns: Columns) -> bool:
-    """Add the columns of a file that begins with `start`, in blocks; False where its rows are not all plain.
+    """Add the columns of a file that begins with `start`, in blocks; False of odd rows.
 
-    They are plain if they are ASCII, and `plain_columns` reads them. Of the whole text `read_csv` makes the same columns.
+    No row is odd if all are ASCII, and `plain_columns` reads them. Of the whole text `read_csv` makes the same columns.
     """
     above, rows, delimiter = _cut(start, path, MIN_NUMBERS)
     if len(rows) < LOOKED_AT or has_comma_numbers(rows, delimiter):

@@ -35,7 +35,7 @@ def read_header(
     stated: dict[str, float],
     remarks: Remarks,
 ) -> tuple[list[str], dict[str, str]]:
-    """Names of the columns and their units, of the lines above the rows, and the first rows.
+    """Names of the columns and their units, by the lines above the rows and the first rows.
 
     What else they state goes into `stated` and `remarks`; in the columns at `grouped` points mark thousands.
     """
