@@ -54,7 +54,7 @@ class Texts(Sequence[str]):
 def plain_columns(
     blocks: Callable[[], Iterable[list[str]]], delimiter: str | None
 ) -> tuple[list[np.ndarray | None], list[Sequence[str]]] | None:
-    """Numbers and texts of columns, of blocks of lines of equally many fields; None of other lines.
+    """Numbers and texts of columns of blocks of lines; None of lines of unequal widths.
 
     A field may have quotes, with no delimiter in them. A column is all of numbers, and has its texts only if it may be a time
     that float64 rounds, or is all of texts. NumPy takes a tenth of the time and memory of Python's fields. A block that cannot
@@ -161,7 +161,7 @@ def decimal_points(texts: Sequence[str], mark: re.Pattern[str]) -> list[str]:
 
 
 def has_comma_numbers(lines: list[str], delimiter: str | None) -> bool:
-    """Whether a field of the first lines is a number with a decimal comma, between other delimiters."""
+    """Whether a field of the first lines has a decimal comma, between other delimiters."""
     fields = (text for row in fields_of(lines[:SAMPLED], delimiter) for text in row)
     return delimiter != "," and any(map(COMMA_NUMBER.fullmatch, fields))
 
