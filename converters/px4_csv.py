@@ -95,7 +95,7 @@ def _read(path: Path, remarks: Remarks) -> Columns:
     """
     lines = [line for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     mark = lines[0][len("timestamp")]
-    names, found = [name.strip() for name in lines[0].split(mark)], plain_columns(lines[1:], mark)
+    names, found = [name.strip() for name in lines[0].split(mark)], plain_columns(lambda: [lines[1:]], mark)
     if len(lines) == 1:
         return {"timestamp": np.zeros(0, np.int64)}
     if found is None or len(found[0]) != len(names):

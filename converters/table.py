@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Int64
 from imutool.errors import ConfigError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses, Scalars, unit_quaternions
@@ -44,9 +45,9 @@ from ._tables.columns.map import (
 from ._tables.columns.motion import settle_accel_unit
 from ._tables.columns.pose_names import why_no_poses
 from ._tables.columns.propose import propose, without_copies
-from ._tables.columns.rotations import known_rotations, of_matrices, unit_by_poses
+from ._tables.columns.rotations import known_rotations, rotations_named, unit_by_poses
 from ._tables.columns.times import COUNTED, begun_at_zero, count_times
-from ._tables.columns.units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
+from ._tables.columns.units import ACCEL_SI, GYRO_SI, POSITION_SI, unit_doubts
 from ._tables.files.formats import kind_of, load
 from ._tables.files.layouts import known_layout
 from ._tables.recordings.folder import load_split, sequences_below
@@ -88,15 +89,18 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
     for each in (each for each in tables if each.rate_hz):
         refuse_joined(columns, columns.unsigned(each.gyro[0]), place)
     table = tables[0]  # other columns are on its clock
-    imus = {each.topic: _imu(columns, each, place) for each in tables}
-    used = {c for each in tables for c in (each.time, each.counter, each.accel_time, *each.gyro, *each.accel)}
+    turns = *table.quaternion_wxyz, *table.roll_pitch_yaw, *matrix_columns(table.rotation_matrix)
+    true = {table.truth_time, *table.position, *turns}
+    samples = {c for each in tables for c in (*each.gyro, *each.accel)}
+    used = samples | {c for each in tables for c in (each.time, each.counter, each.accel_time)}
+    columns = replace(columns, values={**columns.values})
+    imus = {each.topic: _imu(columns, each, place, samples - true if each is tables[-1] else set()) for each in tables}
     poses = _truth(columns, table, path, place, remarks, imus[table.topic])
     group = next((g for g in (POSES_GROUP, TRUTH_GROUP) if g in columns.sources), "") if path.is_dir() else ""
     if not poses and (group or "pose_kind" in given):
         remarks.losses.append(f"{columns.sources.get(group, path.name)} gives no poses: {why_no_poses(columns, group)}")
     if poses and not table.truth_file:
-        turns = *table.quaternion_wxyz, *table.roll_pitch_yaw, *matrix_columns(table.rotation_matrix)
-        used |= {table.truth_time, *table.position, *turns}
+        used |= true
     scalars, constants = _further(columns, tables, {column.removeprefix("-") for column in used}, place)
     remarks.losses.extend(sequence.losses)
     log = MessageLog(
@@ -200,12 +204,18 @@ def _clocked(columns: Columns, table: TableMap, place: Path) -> TableMap:
     return msgspec.structs.replace(table, **pose_clock(columns, msgspec.structs.asdict(table)))
 
 
-def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
-    """IMU of a map, on the gyro's stamps."""
+def _imu(columns: Columns, table: TableMap, place: Path, spent: set[str]) -> Imu:
+    """IMU of a map, on the gyro's stamps; of the columns that are `spent` the values are let go."""
     gyro_ns = times_named(columns, table.time, table.time_unit, place)
     accel_ns = times_named(columns, table.accel_time, table.time_unit, place) if table.accel_time else gyro_ns
-    gyro = vectors_named(columns, table.gyro, table.gyro_scale, table.gyro_offset, place) * GYRO_SI[table.gyro_unit]
-    accel = vectors_named(columns, table.accel, table.accel_scale, table.accel_offset, place) * ACCEL_SI[table.accel_unit]
+    gyro = vectors_named(columns, table.gyro, table.gyro_scale, table.gyro_offset, place)
+    accel = vectors_named(columns, table.accel, table.accel_scale, table.accel_offset, place)
+    gyro *= GYRO_SI[table.gyro_unit]
+    accel *= ACCEL_SI[table.accel_unit]
+    for each in (gyro_ns, gyro, accel):
+        each.flags.writeable = False  # so that the IMU needs no copy
+    for column in map(columns.unsigned, spent):
+        columns.values[column] = np.broadcast_to(0.0, len(columns.values[column]))
     for label, t_ns, values in (("gyro", gyro_ns, gyro), ("accel", accel_ns, accel)):
         if len(t_ns) != len(values):
             fix = "Name its times as `accel_time`" if label == "accel" and not table.accel_time else ""
@@ -229,7 +239,7 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
             raise ConfigError(f"truth_file {table.truth_file!r} does not exist", where=where)
         columns = load(other, kind_of(head(other), other))
     t_ns = times_named(columns, table.truth_time or table.time, table.truth_time_unit or table.time_unit, where)
-    q_wxyz = _rotations(columns, table, where)
+    q_wxyz = rotations_named(columns, table, where)
     p = np.zeros((len(q_wxyz), 3))
     if table.position:
         p = vectors_named(columns, table.position, POSITION_SI[table.position_unit], 0.0, where)
@@ -250,17 +260,6 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
     if not table.position:
         remarks.notes.append("the poses have no positions: zeros stand for them, and nothing is compared with them")
     return {topic: Poses(kept.t_ns, kept.values[:, :3], unit_quaternions(kept.values[:, 3:]))}
-
-
-def _rotations(columns: Columns, table: TableMap, where: Path) -> Float64[np.ndarray, "n 4"]:
-    """Quaternions (wxyz) of the columns that the map names for the poses."""
-    if table.quaternion_wxyz:
-        return vectors_named(columns, table.quaternion_wxyz, 1.0, 0.0, where)
-    if table.roll_pitch_yaw:
-        angles = vectors_named(columns, table.roll_pitch_yaw, ANGLE_SI[table.roll_pitch_yaw_unit], 0.0, where)
-        return quaternion.of_roll_pitch_yaw(angles)
-    nine = matrix_columns(table.rotation_matrix)
-    return of_matrices(vectors_named(columns, nine, 1.0, 0.0, where).reshape(-1, 3, 3), where)
 
 
 def _further(

@@ -141,17 +141,18 @@ def chunks(group: Sequence[Series]) -> Iterator[Chunk]:
     times = np.concatenate([series.t_ns for series in group])
     if len(times) and times.min() < 0:
         raise DataError(f"a message has the time {times.min()} ns", expected="no time before 1970")
-    which = np.repeat(np.arange(len(group)), [len(series.t_ns) for series in group])
+    which = np.repeat(np.arange(len(group), dtype=np.uint16), [len(series.t_ns) for series in group])
     order = np.argsort(times, kind="stable")
     times, which = times[order], which[order]
+    del order
     widths = np.array([series.records(slice(0, 0)).shape[1] for series in group], np.int64)
-    ends = np.cumsum(widths[which])
-    starts = ends - widths[which]
-    cuts = np.flatnonzero(np.diff(starts // CHUNK_BYTES)) + 1
+    edges = np.zeros(len(times) + 1, np.int64)
+    np.cumsum(widths[which], out=edges[1:])
+    cuts = np.unique(np.searchsorted(edges[:-1], np.arange(CHUNK_BYTES, edges[-1], CHUNK_BYTES)))
     done = [0] * len(group)
-    for first, last in pairwise([0, *cuts.tolist(), len(times)] if len(times) else []):
-        offsets = starts[first:last] - starts[first]
-        data = np.empty(int(ends[last - 1] - starts[first]), np.uint8)
+    for first, last in pairwise([0, *cuts[cuts < len(times)].tolist(), len(times)] if len(times) else []):
+        offsets = edges[first:last] - edges[first]
+        data = np.empty(int(edges[last] - edges[first]), np.uint8)
         for index, series in enumerate(group):
             own_bytes = offsets[which[first:last] == index]
             if len(own_bytes):

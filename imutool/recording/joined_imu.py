@@ -142,23 +142,28 @@ def _together(
     count = int((min(int(on_one_clock[-1]), int(accel_ns[-1])) - start) * 1e-9 / STEP_S)
     if count < PARTS * 10 * round(LONGEST_S / STEP_S):
         return None
-    rate = _resampled(gyro_ns, gyro, start, count)
-    force = _resampled(accel_ns, accel, start, count)
+    first, last = 0, count
+    rate = _resampled(gyro_ns, gyro, start, first, last)
     if count * STEP_S > MAX_S:
         window = round(MAX_S / STEP_S)
-        turned = np.concatenate([[0.0], np.cumsum((rate**2).sum(axis=1))])
+        turned = np.concatenate([[0.0], np.cumsum(rate[:, 0] ** 2 + rate[:, 1] ** 2 + rate[:, 2] ** 2)])
         first = int(np.argmax(turned[window:] - turned[:-window]))
-        rate, force = rate[first : first + window], force[first : first + window]
-    return rate, force
+        last = first + window
+        rate = rate[first:last].copy()
+    before, behind = min(first, SMOOTHED), min(count - last, SMOOTHED)  # steps that the smoothing takes in
+    force = _resampled(accel_ns, accel, start, first - before, last + behind)
+    return rate, force[before : len(force) - behind]
 
 
 def _resampled(
-    t_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n 3"], start: int, count: int
+    t_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n 3"], start: int, first: int, last: int
 ) -> Float64[np.ndarray, "c 3"]:
-    """Values at equal steps, smoothed."""
-    t, grid = (t_ns - start) * 1e-9, STEP_S * np.arange(count)
-    mean = np.full(SMOOTHED, 1.0 / SMOOTHED)
-    return np.stack([np.convolve(np.interp(grid, t, column), mean, "same") for column in values.T], axis=1)
+    """Values at equal steps from `start` on, of which they are the steps from `first` to `last`, smoothed."""
+    t, grid, mean = (t_ns - start) * 1e-9, STEP_S * np.arange(first, last), np.full(SMOOTHED, 1.0 / SMOOTHED)
+    smoothed = np.empty((last - first, 3))
+    for column, out in zip(values.T, smoothed.T, strict=True):
+        out[:] = np.convolve(np.interp(grid, t, column), mean, "same")
+    return smoothed
 
 
 def _products(
@@ -260,6 +265,8 @@ def _in_rows(
     both = np.flatnonzero(has_gyro & has_accel)
     if len(both) <= MIN_COMMON * max(has_gyro.sum(), has_accel.sum()):
         return None
+    if len(both) == len(t_ns) and (np.diff(t_ns) > 0).all():  # as nearly all tables are: nothing is copied
+        return JoinedSamples(Imu(t_ns, gyro, accel), both, [])
     parts = (("gyro", has_gyro), ("accel", has_accel))
     notes = [f"{name} {s}: {(~has).sum()} samples that are not finite are left out" for s, has in parts if not has.all()]
     if alone := int((has_gyro != has_accel).sum()):

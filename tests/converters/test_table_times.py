@@ -70,8 +70,8 @@ def test_the_gyro_of_a_phones_folder_is_in_the_unit_of_its_header_or_by_which_gr
 def test_quotes_that_hold_a_delimiter_leave_the_row_to_the_reader_of_quotes():
     """Behind the first rows, in a row that lacks a field, too."""
     rows = [f'{t},"ok",{value}' for t, value in enumerate(GYRO[:300, 0].tolist())]
-    assert plain_columns(rows, ",") is not None
-    assert plain_columns([*rows[:250], '250,"lost, again"', *rows[251:]], ",") is None
+    assert plain_columns(lambda: [rows], ",") is not None
+    assert plain_columns(lambda: [[*rows[:250], '250,"lost, again"', *rows[251:]]], ",") is None
 
 
 @pytest.mark.parametrize(("back_s", "is_lost"), [(T_S[COUNT // 2], True), (2.0, False)])
@@ -585,6 +585,6 @@ def test_texts_of_large_numbers_are_kept_for_what_may_be_a_time_alone():
     """Texts of every column took most of the time and memory of wide tables."""
     t = [f"17000000{row // 10}.{row % 10}00000001" for row in range(100, 400)]
     forces = np.random.default_rng(3).normal(0.0, 1e5, 300)
-    columns = plain_columns([f"{a},{b:.4f}" for a, b in zip(t, forces, strict=True)], ",")
+    columns = plain_columns(lambda: [[f"{a},{b:.4f}" for a, b in zip(t, forces, strict=True)]], ",")
     assert columns is not None
-    assert columns[1] == [t, []]
+    assert [[*texts] for texts in columns[1]] == [t, []]

@@ -292,9 +292,9 @@ def vectors_named(
     Raises:
         ConfigError: there is no such column, or they have different numbers of rows.
     """
-    signs = np.array([1.0 if name in columns.values else -1.0 for name in wanted])
     if len({len(column_named(columns, columns.unsigned(name), where)) for name in wanted}) > 1:
         raise ConfigError(f"{', '.join(wanted)} have different numbers of rows", where=where)
-    unsigned = columns.side_by_side(columns.unsigned(name) for name in wanted)
-    values: Float64[np.ndarray, "n k"] = (unsigned - np.asarray(offset)) * np.asarray(scale) * signs
+    values = columns.side_by_side(columns.unsigned(name) for name in wanted)
+    np.multiply(np.subtract(values, offset, out=values), scale, out=values)
+    values *= np.array([1.0 if name in columns.values else -1.0 for name in wanted])
     return values

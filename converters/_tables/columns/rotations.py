@@ -15,8 +15,8 @@ from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording import interpolate
 
-from ..text.delimited import Columns
-from .map import Entries
+from ..text.delimited import Columns, matrix_columns
+from .map import Entries, TableMap, vectors_named
 from .units import ANGLE_SI, GYRO_SI, TIME_NS, are_unsigned_counts
 
 SPAN_S, LONG_SPAN_S = 0.1, 0.3  # over which turns are compared; over the second, noise of the poses is a smaller part
@@ -217,6 +217,17 @@ def rotations(columns: Columns, entries: Entries) -> Float64[np.ndarray, "n 4"]:
         is_rotation &= np.linalg.det(np.where(is_rotation[:, None, None], matrices, 0.0)) > 0.0
         return of_matrices(np.where(is_rotation[:, None, None], matrices, 0.0))
     return columns.side_by_side(entries["quaternion_wxyz"])
+
+
+def rotations_named(columns: Columns, table: TableMap, where: Path) -> Float64[np.ndarray, "n 4"]:
+    """Quaternions (wxyz) of the columns that the map names for the poses."""
+    if table.quaternion_wxyz:
+        return vectors_named(columns, table.quaternion_wxyz, 1.0, 0.0, where)
+    if table.roll_pitch_yaw:
+        angles = vectors_named(columns, table.roll_pitch_yaw, ANGLE_SI[table.roll_pitch_yaw_unit], 0.0, where)
+        return quaternion.of_roll_pitch_yaw(angles)
+    nine = matrix_columns(table.rotation_matrix)
+    return of_matrices(vectors_named(columns, nine, 1.0, 0.0, where).reshape(-1, 3, 3), where)
 
 
 class _GyroTurns(NamedTuple):

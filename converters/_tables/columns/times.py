@@ -105,9 +105,10 @@ def fill_own_times(columns: Columns) -> None:
         if not any(np.isfinite(columns.values[c][missing].astype(float)).any() for c in beside):
             rows, filled = np.arange(len(values)), values.astype(float)
             filled[missing] = np.interp(rows[missing], rows[~missing], filled[~missing])
-            columns.values[column], texts = filled, columns.texts.get(column, [])
+            columns.values[column], texts = filled, [*columns.texts.get(column, [])]
             for row in np.flatnonzero(missing).tolist() if texts else ():
                 texts[row] = str(filled[row])
+            columns.texts |= {column: texts} if texts else {}
 
 
 def rises(values: np.ndarray) -> bool:

@@ -42,7 +42,7 @@ RAW_BAND = 0.1  # share by which the median length of counts may differ from gra
 
 def gravity_units(columns: Columns, chosen: Sequence[str], factor: float = 1.0) -> tuple[float, list[str]]:
     """Median length times a factor, and units in which it is gravity; none for motion alone."""
-    level = factor * _usual(np.linalg.norm([columns.values[c].astype(float) for c in chosen], axis=0), 0.5)
+    level = factor * _usual(np.linalg.norm([columns.values[c] for c in chosen], axis=0), 0.5)
     return level, [] if is_motion_alone(columns, chosen) else [
         u for u, size in ACCEL_SI.items() if u != "ft/s^2" and abs(level * size / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND
     ]
@@ -50,8 +50,9 @@ def gravity_units(columns: Columns, chosen: Sequence[str], factor: float = 1.0) 
 
 def is_motion_alone(columns: Columns, chosen: Sequence[str]) -> bool:
     """Whether accelerations have no gravity: their lengths reach far down, and they cancel out."""
-    values = np.stack([columns.values[c].astype(float) for c in chosen], axis=1)
-    values = values[np.isfinite(values).all(axis=1)]
+    values = columns.side_by_side(chosen)
+    if not (known := np.isfinite(values).all(axis=1)).all():
+        values = values[known]
     lengths = np.linalg.norm(values, axis=1)
     level = _usual(lengths, 0.5)
     if not level > 0.0:
@@ -90,7 +91,7 @@ def unit_doubts(imu: Imu, gyro_unit: str, accel_unit: str) -> list[str]:
 def _usual(values: Float64[np.ndarray, "*n"], share: float) -> float:
     """Quantile of the finite values; nan without any."""
     finite = values[np.isfinite(values)]
-    return float(np.quantile(finite, share)) if len(finite) else float("nan")
+    return float(np.quantile(finite, share, overwrite_input=True)) if len(finite) else float("nan")
 
 
 def raw_counts(accel: Float64[np.ndarray, "n 3"]) -> tuple[int, int] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from decimal import Decimal, InvalidOperation
 
@@ -24,7 +25,7 @@ SIZES = *(2**k for k in range(4, 33)), *(10**k for k in range(10)), *PARTS_IN_UN
 MIN_ROWS = 20  # of a recording, in the mean
 
 
-def stamps(values: np.ndarray, texts: list[str] | None, unit_ns: int, where: str) -> Int64[np.ndarray, " n"]:
+def stamps(values: np.ndarray, texts: Sequence[str] | None, unit_ns: int, where: str) -> Int64[np.ndarray, " n"]:
     """Times in nanoseconds; decimals of a text file are exact.
 
     Raises:
@@ -34,7 +35,8 @@ def stamps(values: np.ndarray, texts: list[str] | None, unit_ns: int, where: str
         return values.astype(np.int64) * unit_ns
     if texts is not None:
         with suppress(InvalidOperation, OverflowError, ValueError):
-            return np.array([int((Decimal(text) * unit_ns).to_integral_value()) for text in texts], np.int64)
+            ns = (int((Decimal(text) * unit_ns).to_integral_value()) for text in texts)
+            return np.fromiter(ns, np.int64, len(texts))
     odd = ~(np.abs(values.astype(np.float64)) * unit_ns < LAST_NS)
     if odd.any():
         first = f"the first in row {int(odd.argmax()) + 1}: {values[odd.argmax()]}"

@@ -51,18 +51,28 @@ def long_table(text: str, path: Path) -> tuple[str, int]:
     return found
 
 
+def has_signals(text: str) -> bool:
+    """Whether a text has the header of a long table."""
+    return None not in _long_header(text)
+
+
+def _long_header(text: str) -> tuple[str, list[str], int | None, int | None]:
+    """Delimiter and fields of the header, and the places of a time and of the value."""
+    first = next((line for line in text.split("\n", MAX_COMMENTS)[:MAX_COMMENTS] if line.strip() and line[0] != "#"), "")
+    mark = next((mark for mark in ";\t," if mark in first), "")
+    header = next(csv.reader([first], delimiter=mark)) if mark else []
+    names = [split_name(name)[0] for name in header]
+    time = next((n for n, name in enumerate(names) if re.fullmatch(TIME_WORDS, name)), None)
+    return mark, header, time, next((n for n, name in enumerate(names) if name == "value"), None)
+
+
 def of_long(text: str) -> tuple[str, int]:
     """A long table as a row for each time, and how many are left out; nothing of other text.
 
     Its signals share their times, and none has two values at one time.
     """
-    first = next((line for line in text.split("\n", MAX_COMMENTS)[:MAX_COMMENTS] if line.strip() and line[0] != "#"), "")
-    mark = next((mark for mark in ";\t," if mark in first), "")
-    header = next(csv.reader([first], delimiter=mark)) if mark else []
-    names = [split_name(name)[0] for name in header]
-    value = next((n for n, name in enumerate(names) if name == "value"), None)
-    time = next((n for n, name in enumerate(names) if re.fullmatch(TIME_WORDS, name)), None)
-    if value is None or time is None:
+    mark, header, time, value = _long_header(text)
+    if time is None or value is None:
         return "", 0
     lines = text.splitlines()[: None if text.endswith("\n") else -1]
     rows = [row for row in csv.reader(lines, delimiter=mark) if len(row) == len(header) and row != header and row[0][:1] != "#"]

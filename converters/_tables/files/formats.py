@@ -17,11 +17,12 @@ from ..._source import head
 from ..columns.headerless import as_table, name_headerless
 from ..columns.motion import add_gravity
 from ..columns.times import fill_own_times, join_gps_weeks, read_clocks_and_days
-from ..text.delimited import FIRSTS, Columns, add_fields, is_text_table, read_csv, text_of
+from ..text.blocks import first_block, text_of
+from ..text.delimited import FIRSTS, Columns, add_fields, is_text_table, read_csv, read_plain
 from ..text.names import group_of, is_named_time, leaf_of, tells_apart
 from ..text.numbers import is_number
 from ..text.packed import goes_back, read_bytes, text_head
-from .echo import long_table, of_echo, of_long
+from .echo import has_signals, long_table, of_echo, of_long
 from .hdf5 import load_hdf5, names_of_hdf5
 from .json_documents import is_json, load_json
 from .layouts import state_units
@@ -30,7 +31,7 @@ from .merged import join_calendar, join_milliseconds, join_stamps, settle_zones,
 from .mocap import is_mocap, read_mocap
 from .npz import load_npy, load_npz
 from .programs import GYROFLOW, of_labview, of_vectornav, scale_gyroflow, scale_stated, state_mip
-from .sensors import read_rows
+from .sensors import names_sensors, read_rows
 from .sheets import load_sheets
 
 NO_NUMBERS = "holds no columns of numbers"
@@ -154,6 +155,20 @@ def _members(path: Path) -> set[str]:
         return set()
 
 
+def _load_text(path: Path, columns: Columns) -> None:
+    start = first_block(path)
+    if start and not _is_of_program(start) and read_plain(path, start, columns):
+        _finish(start, columns)
+    else:
+        read_text(text_of(read_bytes(path)), columns, path)
+
+
+def _is_of_program(start: str) -> bool:
+    """Whether a text is no table as it stands, but one that a program wrote in its own way, by its first lines."""
+    of_program = is_mocap(start) or of_labview(start) or of_vectornav(start, Columns()) or has_signals(start)
+    return bool(of_program or of_echo(start)[0] or as_table(start)[0] or names_sensors(start))
+
+
 def read_text(text: str, columns: Columns, path: Path) -> None:
     """Add the columns of a table of text, whatever program wrote it."""
     if read_mocap(text, columns, path):
@@ -175,9 +190,14 @@ def read_text(text: str, columns: Columns, path: Path) -> None:
             columns.remarks.losses.append(f"{damaged} lines with a part of these names are left out")
     elif not read_rows(text, columns, path):
         read_csv(text, columns, path)
-        name_headerless(columns)
-        if text.startswith(GYROFLOW):
-            scale_gyroflow(columns)
+        _finish(text, columns)
+
+
+def _finish(text: str, columns: Columns) -> None:
+    """Name and scale the columns of a plain table that begins with the text."""
+    name_headerless(columns)
+    if text.startswith(GYROFLOW):
+        scale_gyroflow(columns)
 
 
 def _load_parquet(path: Path, columns: Columns) -> None:
@@ -254,7 +274,7 @@ OF_GROUPS: dict[str, Callable[[Path], list[str]]] = {  # names of the arrays, wi
     "hdf5": names_of_hdf5,
 }
 LOADERS: dict[str, Callable[[Path, Columns], None]] = {
-    "csv": lambda path, columns: read_text(text_of(read_bytes(path)), columns, path),
+    "csv": _load_text,
     "json": load_json,
     "parquet": _load_parquet,
     "feather": _load_feather,

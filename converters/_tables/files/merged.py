@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from itertools import product
+from itertools import compress, product
 
 import numpy as np
 
@@ -252,7 +252,7 @@ def _take_rows(columns: Columns, column: str, rows: np.ndarray, into: Columns, n
     """Put some rows of a column into other columns."""
     into.values[name], into.units[name] = columns.values[column][rows], columns.units.get(column, "")
     if column in columns.texts:
-        into.texts[name] = [columns.texts[column][row] for row in np.flatnonzero(rows).tolist()]
+        into.texts[name] = [*compress(columns.texts[column], rows)]
 
 
 def join_positions(columns: Columns) -> None:

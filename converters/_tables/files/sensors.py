@@ -16,7 +16,8 @@ import numpy as np
 
 from ..columns.headerless import name_headerless
 from ..columns.times import in_batches, rises
-from ..text.delimited import COMMENTS, Columns, read_csv
+from ..text.delimited import Columns, read_csv
+from ..text.header import COMMENTS
 from ..text.names import UNITS, is_of_recordings, split_name
 from ..text.numbers import is_number
 
@@ -88,10 +89,14 @@ def _pairs(names: Mapping[str, str]) -> dict[str, str]:
     return {n: f"{re.sub(r'^(?=[0-9]|$)', 'imu', rest)}/{s}" for rest, pair in whole.items() for n, s in pair.items()}
 
 
+def names_sensors(text: str) -> tuple[str, int, dict[str, str]] | None:
+    """Delimiter, place of a row's sensor in it, and names of gyro and accel; None of other text."""
+    return _sensor_rows(text[:LOOKED_AT]) or _rows_of_kinds(text[:LOOKED_AT])
+
+
 def read_rows(text: str, columns: Columns, path: Path) -> bool:
     """Add the columns of each sensor of a text whose rows name theirs; False for any other text."""
-    found = _sensor_rows(text[:LOOKED_AT]) or _rows_of_kinds(text[:LOOKED_AT])
-    if found is None:
+    if (found := names_sensors(text)) is None:
         return False
     mark, place, sensors = found
     lines = [line for line in text.splitlines() if line.strip()]

@@ -33,7 +33,8 @@ from ..files.formats import NO_NUMBERS, kind_of, load
 from ..files.merged import join_positions
 from ..files.npz import npy_shape, read_npy
 from ..files.sensors import SENSORS, SPACED, name_columns, sensors_among
-from ..text.delimited import LOOKED_AT, Columns, is_text_table, read_csv, text_of
+from ..text.blocks import text_of
+from ..text.delimited import LOOKED_AT, Columns, is_text_table, read_csv
 from ..text.header import MOSTLY
 from ..text.names import TIME_WORDS, is_named_time, leaf_of, listed, name_and_unit, split_name
 from ..text.packed import read_bytes, table_name

@@ -20,7 +20,8 @@ from ..files.formats import NO_NUMBERS, kind_of, load, read_text
 from ..files.layouts import known_layout
 from ..files.mocap import is_mocap
 from ..files.sensors import name_columns
-from ..text.delimited import MIN_NUMBERS, Columns, is_text_table, read_csv, text_of
+from ..text.blocks import text_of
+from ..text.delimited import MIN_NUMBERS, Columns, is_text_table, read_csv
 from ..text.packed import opener, text_head
 
 MAX_LOOKED = 64 << 20  # bytes of a table that is no text

@@ -7,7 +7,7 @@ Columns of one length are a table.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -230,7 +230,8 @@ def _is_left(rows: Rows | None) -> bool:
     return rows is None or len(rows) > 0
 
 
-def _texts_in(texts: list[str], rows: Rows | None) -> list[str]:
+def _texts_in(texts: Iterable[str], rows: Rows | None) -> list[str]:
+    texts = [*texts]
     return texts if rows is None else [texts[row] for row in rows.tolist()]
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable
+from array import array
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -56,7 +57,7 @@ SPAN = re.compile(  # 0 days 00:00:00.010000, of pandas; 0.01 sec, of MATLAB
 SPAN_S = {"sec": 1.0, "min": 60.0, "hr": 3600.0}
 
 
-def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]] | None:
+def calendar_times(texts: Sequence[str]) -> tuple[Int64[np.ndarray, " n"], list[str]] | None:
     """Nanoseconds since 1970 of dates, with notes; None for other texts.
 
     Clocks without a date count from the first midnight. Of 4/5/2026 the month is the first number, unless one exceeds 12 there.
@@ -68,13 +69,14 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
         texts = [NAMED.sub(lambda m: f"{m[3]}-{MONTHS.index(m[2].lower()) + 1}-{m[1]}", text) for text in texts]
     if texts and COMPACT.match(texts[0]):
         texts = [COMPACT.sub(r"\1-\2-\3T\4:\5:\6", text, count=1) for text in texts]
-    matches = [DATE.fullmatch(text) for text in texts]
-    slashes = [match for match in matches if match and match["sign"] == "/"]
-    day_first = any(int(match["first"]) > 12 for match in slashes)
-    stamps = []
-    for match in matches:
-        if match is None:
+    dates = (match for text in texts if "/" in text and (match := DATE.fullmatch(text)))
+    slashes = [int(match["first"]) for match in dates if match["sign"] == "/"]
+    day_first = any(first > 12 for first in slashes)
+    stamps, has_zone = array("q"), False
+    for text in texts:
+        if (match := DATE.fullmatch(text)) is None:
             return _clock_times(texts)
+        has_zone = bool(match["zone"]) if not stamps else has_zone
         month_first = match["sign"] == "/" and not day_first
         day, month = (match["second"], match["first"]) if month_first else (match["first"], match["second"])
         date = f"{match['year'] or match['last']}-{(match['month'] or month).zfill(2)}-{(match['day'] or day).zfill(2)}"
@@ -86,10 +88,11 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
             seconds += HALF_DAY_S * ((half.upper() == "PM") - (match["clock"].startswith("12")))
         if (zone := match["zone"]) and zone[0] in "+-":
             seconds -= int(f"{zone[0]}1") * (3600 * int(zone[1:3]) + 60 * int(zone[3:].strip(":") or 0))
-        stamps.append(seconds * 10**9 + int((match["fraction"] or "0").ljust(9, "0")))
-    if not 0 <= min(stamps) <= max(stamps) <= LAST_NS:
-        return None
-    notes = [] if matches[0] is None or matches[0]["zone"] else [NO_ZONE]
+        t_ns = seconds * 10**9 + int((match["fraction"] or "0").ljust(9, "0"))
+        if not 0 <= t_ns <= LAST_NS:
+            return None
+        stamps.append(t_ns)
+    notes = [] if has_zone else [NO_ZONE]
     if slashes:
         notes.append(f"its dates count as {'day/month' if day_first else 'month/day'}/year")
     return np.array(stamps, np.int64), notes
@@ -179,13 +182,13 @@ NUMBERED: tuple[tuple[Callable[[np.ndarray], Int64[np.ndarray, " n"] | None], st
 )
 
 
-def damaged_times(texts: list[str]) -> list[tuple[int, str]]:
+def damaged_times(texts: Sequence[str]) -> list[tuple[int, str]]:
     """Rows and fields of another form than most, which are dates or clocks."""
     odd = ([(row, text) for row, text in enumerate(texts, 1) if not form.fullmatch(text)] for form in (DATE, CLOCK))
     return next((fields for fields in odd if len(fields) < len(texts) / 2), [])
 
 
-def join_dates(names: list[str], fields: list[list[str]]) -> int | None:
+def join_dates(names: list[str], fields: list[Sequence[str]]) -> int | None:
     """Make one column of dates and their clocks; return the place of the one that is gone."""
     dates = [n for n, texts in enumerate(fields) if re.fullmatch(DAY, next(iter(texts), ""))]
     times = [n for n, texts in enumerate(fields) if re.fullmatch(DAYTIME, next(iter(texts), ""), re.IGNORECASE)]
@@ -208,13 +211,14 @@ def gps_times(week: Int64[np.ndarray, " n"], ns: Int64[np.ndarray, " n"]) -> tup
     return since_1970 - leap_s * 10**9, leap_s
 
 
-def _clock_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]] | None:
+def _clock_times(texts: Sequence[str]) -> tuple[Int64[np.ndarray, " n"], list[str]] | None:
     """Times of the day, or of the hour, in nanoseconds since the first midnight; a step back of half of it begins the next."""
-    matches = [CLOCK.fullmatch(text) for text in texts]
-    if not all(matches):
+    if not all(map(CLOCK.fullmatch, texts)):
         return None
-    parts = [match.groups(default="0") for match in matches if match]
-    t_ns = np.array([(int(h) * 3600 + int(m) * 60 + int(s)) * 10**9 + int(f.ljust(9, "0")) for h, m, s, f in parts], np.int64)
-    whole = (24 if matches[0] and matches[0][1] else 1) * HOUR_NS
+    parts = (match.groups(default="0") for match in map(CLOCK.fullmatch, texts) if match)
+    ns = ((int(h) * 3600 + int(m) * 60 + int(s)) * 10**9 + int(f.ljust(9, "0")) for h, m, s, f in parts)
+    t_ns = np.fromiter(ns, np.int64, len(texts))
+    first = CLOCK.fullmatch(texts[0])
+    whole = (24 if first and first[1] else 1) * HOUR_NS
     t_ns += whole * np.concatenate([[0], np.cumsum(np.diff(t_ns) < -whole // 2)])
     return t_ns, [f"its times name no date and count from the start of the {'day' if whole > HOUR_NS else 'hour'}"]

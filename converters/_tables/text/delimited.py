@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,14 +18,16 @@ from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
+from .blocks import AROUND, MAX_LINE, rows_in_blocks, text_of
 from .dates import NO_ZONE, calendar_times, damaged_times, join_dates
-from .header import header_of, note_unused_header, refuse_other_header, units_in_comments, without_numbers_of_columns
+from .header import COMMENTS, read_header, refuse_other_header, without_numbers_of_columns
 from .names import leaf_of, tells_apart
 from .numbers import (
     COMMA_NUMBER,
     DECIMAL_COMMA,
     decimal_points,
     fields_of,
+    has_comma_numbers,
     is_number,
     no_numbers,
     numbers,
@@ -37,18 +39,11 @@ from .numbers import (
 from .packed import UTF16
 
 WIDEST = 64  # columns of a matrix; wider ones are images
-MAX_LINE, TRANSPOSE = 65_536, "Transpose it, if it holds a sample a column"
+TRANSPOSE = "Transpose it, if it holds a sample a column"
 MIN_NUMBERS = 4  # in a row: a time and a vector
 MIN_NAMED = 0.1  # share of the rows that have as many fields as the header, if it is theirs
 LOOKED_AT = 200  # first lines, which show whether text is a table, and its words between the numbers
 FIRSTS = 50  # rows that show what a column without a name counts
-AROUND = "\ufeff \t"  # a header that a program has written again
-COMMENTS = "#", "%", "//"
-FIRST_CHARACTERS = 4096  # of a text, which show how its lines begin
-ARRIVAL = re.compile(r"^(\d\d:\d\d:\d\d\.\d{3}) -> ")  # of Arduino's serial monitor
-STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
-    r"\W*(?P<name>[a-z][\w ]{,40}?) *[:=,;\t] *(?P<value>\d{1,9}(\.\d{,15})?) *(?P<unit>k?hz|m?s)?\W*", re.IGNORECASE
-)
 
 
 def matrix_columns(named: str | list[str]) -> list[str]:
@@ -63,7 +58,7 @@ class Columns:
     values: dict[str, np.ndarray] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     numbers: dict[str, float] = field(default_factory=dict)
-    texts: dict[str, list[str]] = field(default_factory=dict)
+    texts: dict[str, Sequence[str]] = field(default_factory=dict)
     labels: dict[str, list[str]] = field(default_factory=dict)  # texts of columns that tell recordings or sensors apart
     remarks: Remarks = field(default_factory=Remarks)
     sources: dict[str, str] = field(default_factory=dict)
@@ -100,10 +95,11 @@ class Columns:
         elif array.size == 1:
             self.numbers[name] = float(array.reshape(-1)[0])
 
-    def add_labels(self, name: str, texts: list[str]) -> None:
+    def add_labels(self, name: str, texts: Sequence[str]) -> None:
         """Take in the texts of a column, which are lost unless they tell recordings or sensors apart."""
         if tells_apart(leaf_of(name)):
-            self.labels[name] = texts
+            seen: dict[str, str] = {}
+            self.labels[name] = [seen.setdefault(text, text) for text in texts]  # a few labels, each in memory once
         self.remarks.losses.append(no_numbers(name, texts))
 
     def unsigned(self, name: str) -> str:
@@ -112,8 +108,8 @@ class Columns:
 
     def side_by_side(self, names: Iterable[str]) -> Float64[np.ndarray, "n k"]:
         """Columns as one array; one named with a minus counts the other way."""
-        signed = ((1.0 if name in self.values else -1.0, self.unsigned(name)) for name in names)
-        return np.stack([sign * self.values[name].astype(float) for sign, name in signed], axis=1)
+        columns = ((name in self.values, self.values[self.unsigned(name)].astype(float, copy=False)) for name in names)
+        return np.stack([values if is_plain else -1.0 * values for is_plain, values in columns], axis=1)
 
     def take(self, group: str, other: Columns, label: str) -> None:
         """Take in the columns and remarks of another table as a group."""
@@ -127,31 +123,6 @@ class Columns:
         self.numbers |= {f"{group}/{name}": value for name, value in other.numbers.items()}
         self.remarks.notes.extend(f"{label}: {note}" for note in other.remarks.notes)
         self.remarks.losses.extend(f"{label}: {loss}" for loss in other.remarks.losses)
-
-
-def text_of(raw: bytes) -> str:
-    """Text in UTF-8, UTF-16 or the code page of Western Windows; lines and minus as in ASCII."""
-    return _with_arrivals(_decoded(raw).replace("\r\n", "\n").replace("\r", "\n").replace("\u2212", "-"))
-
-
-def _decoded(raw: bytes) -> str:
-    if raw.startswith(UTF16):
-        return raw.decode("utf-16", "replace")
-    try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        cut = error.start >= len(raw) - 3  # inside a character
-        return raw.decode("utf-8-sig", "ignore") if cut else raw.decode("cp1252", "replace")
-
-
-def _with_arrivals(text: str) -> str:
-    """Text in which the times before Arduino's rows are fields, `15:04:05.123 -> 0.1,0.2`; any other text as it is."""
-    rows = [row for line in text[:FIRST_CHARACTERS].splitlines() if (row := ARRIVAL.sub("", line)) != line]
-    if len(rows) <= text[:FIRST_CHARACTERS].count("\n") / 2:
-        return text
-    mark = max(";\t, ", key=lambda each: sum(each in row for row in rows))
-    named = re.sub(rf"{ARRIVAL.pattern}(?=\D*$)", f"arrival{mark}", text, flags=re.MULTILINE)  # a board's own time counts first
-    return re.sub(ARRIVAL.pattern, rf"\1{mark}", named, flags=re.MULTILINE)
 
 
 def is_text_table(head: bytes, minimum: int = MIN_NUMBERS) -> bool:
@@ -194,31 +165,54 @@ def read_csv(text: str, columns: Columns, path: Path, minimum: int = MIN_NUMBERS
     Raises:
         DataError: a line is too long for a table.
     """
+    above, rows, delimiter = _cut(text, path, minimum)
+    header = {line.strip(AROUND) for line in above}
+    kept = [line for line in rows if line.strip(AROUND) not in header]
+    if repeated := len(rows) - len(kept):  # as of files that were joined
+        columns.remarks.notes.append(f"{repeated} lines that repeat the header are left out")
+    body, grouped = without_thousands(kept, delimiter)
+    values, fields, width = _columns_of(body, above, delimiter, columns)
+    refuse_other_header(fields, path)
+    named = read_header(above, kept[:FIRSTS], delimiter, width, grouped, columns.numbers, columns.remarks)
+    _add_columns(columns, *named, values, fields, COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA)
+
+
+def read_plain(path: Path, start: str, columns: Columns) -> bool:
+    """Add the columns of a file that begins with `start`, in blocks; False of odd rows.
+
+    No row is odd if all are ASCII, and `plain_columns` reads them. Of the whole text `read_csv` makes the same columns.
+    """
+    above, rows, delimiter = _cut(start, path, MIN_NUMBERS)
+    if len(rows) < LOOKED_AT or has_comma_numbers(rows, delimiter):
+        return False
+    header = {line.strip(AROUND) for line in above}
+    plain = plain_columns(lambda: rows_in_blocks(path, rows, header), delimiter)
+    if plain is None:
+        return False
+    named = read_header(above, rows[:FIRSTS], delimiter, len(plain[0]), [], columns.numbers, columns.remarks)
+    _add_columns(columns, *named, *plain, COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA)
+    return True
+
+
+def _cut(text: str, path: Path, minimum: int) -> tuple[list[str], list[str], str | None]:
+    """Lines above the rows of a table, the rows, and their delimiter."""
     lines = [line for line in text.splitlines() if line.strip()]
     if any(len(line) > MAX_LINE for line in lines):
         raise DataError("has a line of more than 65 536 characters", where=path, expected="a sample a row", fix=TRANSPOSE)
     lines = without_numbers_of_columns(lines, delimiter := _delimiter(lines, minimum))
     first = next((n for n, line in enumerate(lines) if _is_row(line, delimiter, minimum)), len(lines))
-    several = (
-        part for line in lines[:first] if line.startswith(COMMENTS) for part in re.split(r", |: (?=.*=)| (?=\w+=\S)", line)
-    )
-    stated = filter(None, map(STATED_NUMBER.fullmatch, [*lines[:first], *several]))
-    columns.numbers |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in stated}
-    above = {line.strip(AROUND) for line in lines[:first]}
-    kept = lines[:first] + [line for line in lines[first:] if line.strip(AROUND) not in above]
-    if repeated := len(lines) - len(kept):  # as of files that were joined
-        lines = kept
-        columns.remarks.notes.append(f"{repeated} lines that repeat the header are left out")
-    body, grouped = without_thousands(lines[first:], delimiter)
-    values, fields, width = _columns_of(body, lines[:first], delimiter, columns)
-    refuse_other_header(fields, path)
-    firsts = [row[0].strip().strip('"') for row in fields_of(lines[first : first + FIRSTS], delimiter) if len(row) == width]
-    names, units = header_of(lines[:first], delimiter, width, firsts)
-    columns.remarks.notes.extend([f"points mark thousands: {', '.join(names[k] for k in grouped)}"] if grouped else [])
-    note_unused_header(lines[:first], delimiter, names, columns.remarks)
-    for unit, of in units_in_comments((line for line in lines[:first] if line.startswith(COMMENTS)), names).items():
-        units |= dict.fromkeys(of, unit)
-        columns.remarks.notes.append(f"{', '.join(of)} in {unit}, by a comment above the table")
+    return lines[:first], lines[first:], delimiter
+
+
+def _add_columns(
+    columns: Columns,
+    names: list[str],
+    units: dict[str, str],
+    values: list[np.ndarray | None],
+    fields: list[Sequence[str]],
+    comma: re.Pattern[str],
+) -> None:
+    """Add columns of numbers, and of texts what they hold; `comma` matches a number with a decimal comma."""
     commas, empty = list[str](), list[str]()
     if (joined := join_dates(names, fields)) is not None:
         del values[joined]
@@ -231,10 +225,9 @@ def read_csv(text: str, columns: Columns, path: Path, minimum: int = MIN_NUMBERS
         if not any(texts):
             empty.append(named)
             continue
-        if pointed := decimal_points(texts, COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA):
-            texts[:] = pointed
+        if pointed := decimal_points(texts, comma):
             commas.append(name)
-        add_fields(columns, name, texts, units.get(name, ""))
+        add_fields(columns, name, pointed or texts, units.get(name, ""))
     if unread := ", ".join(filter(None, empty)):
         columns.remarks.notes.append(f"columns without a value are left out: {unread}")
     columns.remarks.notes.extend([f"decimal commas are read as points: {', '.join(commas)}"] if commas else [])
@@ -242,9 +235,9 @@ def read_csv(text: str, columns: Columns, path: Path, minimum: int = MIN_NUMBERS
 
 def _columns_of(
     lines: list[str], above: list[str], delimiter: str | None, columns: Columns
-) -> tuple[list[np.ndarray | None], list[list[str]], int]:
+) -> tuple[list[np.ndarray | None], list[Sequence[str]], int]:
     """Numbers of columns that are read as such, texts of the others, and how many columns there are."""
-    if (plain := plain_columns(lines, delimiter)) is not None:
+    if (plain := plain_columns(lambda: [lines], delimiter)) is not None:
         return *plain, len(plain[0])
     rows = fields_of(lines, delimiter)
     ends = {len(row) for row in fields_of(above, delimiter) if row and row[-1].strip()}
@@ -257,11 +250,11 @@ def _columns_of(
         columns.remarks.notes.append(f"{words} lines of words between the rows are left out")
     if len(others) > words:
         columns.remarks.losses.append(f"{len(others) - words} rows do not have {width} fields and are left out")
-    fields = [[text.strip().strip('"') for text in column] for column in zip(*whole, strict=True)]
+    fields: list[Sequence[str]] = [[text.strip().strip('"') for text in column] for column in zip(*whole, strict=True)]
     return [None] * len(fields), fields, width
 
 
-def add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> None:
+def add_fields(columns: Columns, name: str, texts: Sequence[str], unit: str) -> None:
     """Add a column of texts as numbers, vectors or times, or say what it is instead."""
     if (rows := vectors(texts)) is not None:
         columns.add(name, rows, unit)

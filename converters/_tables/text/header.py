@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,9 +17,39 @@ MAX_WORDS = 10  # in a refusal
 MOSTLY = 0.8  # share of columns above which a text says nothing of a column
 UNIT_TEXT = re.compile(r"[\[(]?(\W*|[a-zµ°]+([ /*^²\d-]+[a-z\d²-]*)*|-)[\])]?", re.IGNORECASE)
 SENSOR_UNITS = "|".join(UNITS[unit] for unit in ("rad/s", "deg/s", "mdeg/s", "m/s^2", "cm/s^2", "ft/s^2", "mg", "g"))
+COMMENTS = "#", "%", "//"
+STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
+    r"\W*(?P<name>[a-z][\w ]{,40}?) *[:=,;\t] *(?P<value>\d{1,9}(\.\d{,15})?) *(?P<unit>k?hz|m?s)?\W*", re.IGNORECASE
+)
 OF_COLUMNS = re.compile(  # in a comment: `gx/gy/gz=deg/s`, `ax, ay, az in g`
     rf"(?P<names>[a-z]\w*(\s*[/,]\s*[a-z]\w*)*)\s*(=|:|\bin\b|[\[(])\s*(?P<unit>{SENSOR_UNITS})(?![\w/^²])"
 )
+
+
+def read_header(
+    above: list[str],
+    rows: list[str],
+    delimiter: str | None,
+    width: int,
+    grouped: list[int],
+    stated: dict[str, float],
+    remarks: Remarks,
+) -> tuple[list[str], dict[str, str]]:
+    """Names of the columns and their units, by the lines above the rows and the first rows.
+
+    What else they state goes into `stated` and `remarks`; in the columns at `grouped` points mark thousands.
+    """
+    several = (part for line in above if line.startswith(COMMENTS) for part in re.split(r", |: (?=.*=)| (?=\w+=\S)", line))
+    matches = filter(None, map(STATED_NUMBER.fullmatch, [*above, *several]))
+    stated |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in matches}
+    firsts = [row[0].strip().strip('"') for row in fields_of(rows, delimiter) if len(row) == width]
+    names, units = header_of(above, delimiter, width, firsts)
+    remarks.notes.extend([f"points mark thousands: {', '.join(names[k] for k in grouped)}"] if grouped else [])
+    note_unused_header(above, delimiter, names, remarks)
+    for unit, of in units_in_comments((line for line in above if line.startswith(COMMENTS)), names).items():
+        units |= dict.fromkeys(of, unit)
+        remarks.notes.append(f"{', '.join(of)} in {unit}, by a comment above the table")
+    return names, units
 
 
 def header_of(lines: list[str], delimiter: str | None, width: int, first: list[str]) -> tuple[list[str], dict[str, str]]:
@@ -115,7 +145,7 @@ def note_unused_header(above: list[str], delimiter: str | None, names: list[str]
         (remarks.losses if is_header else remarks.notes).append(f"{note} ({', '.join(fields)[:200]})")
 
 
-def refuse_other_header(fields: list[list[str]], path: Path) -> None:
+def refuse_other_header(fields: Sequence[Sequence[str]], path: Path) -> None:
     """Refuse rows below another header: their numbers are of other columns, or in other units.
 
     Such a header is a row of different words, or of units.

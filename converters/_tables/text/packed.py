@@ -13,6 +13,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -95,17 +96,22 @@ def read_bytes(path: Path) -> bytes:
     Raises:
         DataError: damaged, or unpacking beyond all proportion.
     """
-    if opener(head(path)) is None:
-        return path.read_bytes()
-    maximum = min(LIMIT, MAX_RATIO * path.stat().st_size + RATIO_FREE)
-    parts: list[bytes] = []
-    total = 0
+    return path.read_bytes() if opener(head(path)) is None else b"".join(bounded_pieces(path))
+
+
+def bounded_pieces(path: Path) -> Iterator[bytes]:
+    """Yield the bytes of a file, unpacked, in pieces of bounded size.
+
+    Raises:
+        DataError: damaged, or unpacking beyond all proportion.
+    """
+    is_packed = opener(head(path)) is not None
+    total, maximum = 0, min(LIMIT, MAX_RATIO * path.stat().st_size + RATIO_FREE)
     for piece in pieces(path):
-        parts.append(piece)
         total += len(piece)
-        if total > maximum:
+        if is_packed and total > maximum:
             raise DataError(f"unpacks to more than {maximum} bytes", where=path, expected=f"at most {MAX_RATIO} to 1")
-    return b"".join(parts)
+        yield piece
 
 
 def _sampled(path: Path) -> list[bytes]:
@@ -156,7 +162,7 @@ def is_packed_alone(start: bytes) -> bool:
 
 
 def pieces(path: Path) -> Iterator[bytes]:
-    """Yield the bytes of a packed file, unpacked, in pieces of bounded size.
+    """Yield the bytes of a file, unpacked, in pieces of bounded size.
 
     Raises:
         DataError: it is damaged or cut off.
@@ -187,12 +193,9 @@ def _zstd_pieces(path: Path) -> Iterator[bytes]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    open_it = opener(head(path))
+    open_it = opener(head(path)) or partial(Path.open, mode="rb")
     try:
-        with refusing(path):
-            if open_it is None:
-                raise ValueError("not packed")
-            with open_it(path) as file:
-                yield file
+        with refusing(path), open_it(path) as file:
+            yield file
     except FOREIGN as error:
         raise DataError(f"cannot be unpacked ({error})", where=path) from error
