@@ -40,6 +40,7 @@ def test_blocks_give_the_columns_of_the_whole_text(tmp_path: Path, monkeypatch: 
     for name, values in whole.values.items():
         assert found.values[name].dtype == values.dtype
         assert found.values[name].tobytes() == values.tobytes()
+    assert [texts[-1] for texts in found.texts.values()] == [texts[-1] for texts in whole.texts.values()]
     assert {name: [*texts] for name, texts in found.texts.items()} == {name: [*texts] for name, texts in whole.texts.items()}
     assert (found.units, found.labels, found.numbers) == (whole.units, whole.labels, whole.numbers)
     assert (found.remarks.notes, found.remarks.losses) == (whole.remarks.notes, whole.remarks.losses)

@@ -47,6 +47,7 @@ class Texts(Sequence[str]):
     def __getitem__(self, row: int | slice) -> str | list[str]:
         if isinstance(row, slice):
             return [*self][row]
+        row = range(len(self))[row]
         block = bisect_right(self._starts, row) - 1
         return self._blocks[block].split("\n")[row - self._starts[block]]
 
