@@ -41,6 +41,10 @@ PLACE = r"/?(meta/|oxts/(data/)?)?[^/]+$"  # of a file below the folder of its r
 HIDDEN = r"(^|/)(__MACOSX/|\.)"
 NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 FIX = "Record the acceleration with gravity, or gravity too"
+NO_PLATFORM = (
+    "no Metadata.csv of Sensor Logger names the phone: the accelerometer counts as Android's, which reads +g upwards. "
+    "An iPhone's reads -g; a Metadata.csv of two lines, `platform` and `ios`, turns its sign"
+)
 MIN_GRAVITY, MAX_IN_G = 0.5, 2.0  # median lengths, in m/s² of nothing but motion, and of readings in g
 
 
@@ -144,7 +148,7 @@ def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str,
     gyro_ns, gyro = _vector(files, tables[gyro_table], clock, where, remarks)
     accel_ns, accel, used = _acceleration(files, tables, clock, where, remarks)
     level = float(np.median(np.linalg.norm(accel, axis=1)))
-    is_alone = used == ("accelerometer",) and "seconds_elapsed" in files.text(tables["accelerometer"]).partition("\n")[0]
+    is_alone = used == ("accelerometer",) and _is_sensor_logger(files, tables["accelerometer"])
     if level <= MIN_GRAVITY or (is_alone and abs(level / STANDARD_GRAVITY - 1.0) > GRAVITY_BAND):
         raise DataError(f"the median acceleration is {level:.3g} m/s^2: gravity was taken out", where=where, fix=FIX)
     if is_alone and (steady := _steady_level(accel_ns, accel)) < STANDARD_GRAVITY / 2.0:
@@ -154,9 +158,13 @@ def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str,
     if in_g := level < MAX_IN_G:
         accel = accel * STANDARD_GRAVITY
         remarks.notes.append(f"the median acceleration is {level:.3g}: it was taken for g, and is now m/s^2")
-    if _is_ios(files) or (in_g and "accelerometeruncalibrated" in used):  # where Sensor Logger writes g on no other system
+    platform = (stated := _metadata(files)).get("platform", "").lower()
+    is_ios = platform == "ios" and stated.get("standardisation", "").lower() != "true"
+    if is_ios or (in_g and "accelerometeruncalibrated" in used):  # where Sensor Logger writes g on no other system
         accel = -accel
         remarks.notes.append("the phone is of Apple, whose accelerometer reads -g upwards: its sign was turned")
+    elif not platform and "totalacceleration" not in used and _is_sensor_logger(files, tables[used[0]]):  # Android's alone
+        remarks.doubt([NO_PLATFORM])
     remarks.notes.append(f"gyro from {tables[gyro_table]}, accel from {' + '.join(tables[table] for table in used)}")
     imu, _, notes = joined(gyro_ns, gyro, accel_ns, accel, IMU_TOPIC)
     remarks.notes.extend(notes)
@@ -217,14 +225,16 @@ def _acceleration(
     return t_ns, accel + steady, (named, "gravity")
 
 
-def _is_ios(files: _Files) -> bool:
-    """Whether Sensor Logger recorded on iOS without standardised frames."""
+def _is_sensor_logger(files: _Files, path: str) -> bool:
+    """Whether a table has the times of Sensor Logger."""
+    return "seconds_elapsed" in files.text(path).partition("\n")[0]
+
+
+def _metadata(files: _Files) -> dict[str, str]:
+    """What Sensor Logger states of its recording, by its names; empty without its table."""
     path = files.tables().get("metadata")
-    if path is None:
-        return False
-    names, _, values = files.text(path).strip().partition("\n")
-    stated = dict(zip(names.strip().split(","), values.split(","), strict=False))
-    return stated.get("platform", "").lower() == "ios" and stated.get("standardisation", "").lower() != "true"
+    names, _, values = files.text(path).strip().partition("\n") if path else ("", "", "")
+    return {key.strip(): value.strip() for key, value in zip(names.split(","), values.split(","), strict=False)}
 
 
 def _clock(files: _Files) -> list[tuple[float, int]]:

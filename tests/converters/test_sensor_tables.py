@@ -93,6 +93,22 @@ def test_a_phones_zip_becomes_an_imu_in_si_units(convert, tmp_path, phone):
     assert ("/Magnetometer/x" in recording.scalars) == ("android" in phone)
 
 
+def test_a_phone_of_sensor_logger_that_nothing_names_is_asked_about(convert, tmp_path):
+    phone = {name: text for name, text in PHONES["sensor logger, ios"].items() if name != "Metadata.csv"}
+    done = convert(pack(tmp_path / "walk.zip", phone), tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "counts as Android's, which reads +g upwards" in done.stderr
+    stated = phone | {"Metadata.csv": "platform\nios\n"}
+    done = convert(pack(tmp_path / "stated.zip", stated), tmp_path / "stated.mcap")
+    assert "counts as Android's" not in done.stderr
+    turned, asked = read(tmp_path / "stated.mcap").imu.accel, read(tmp_path / "out.mcap").imu.accel
+    assert np.array_equal(turned, -asked)
+    np.testing.assert_allclose(turned, GRAVITY + MOTION, rtol=1e-9, atol=1e-12)
+    of_android = {name: text for name, text in PHONES["sensor logger, android"].items() if name != "Metadata.csv"}
+    done = convert(pack(tmp_path / "android.zip", of_android), tmp_path / "android.mcap")
+    assert "counts as Android's" not in done.stderr
+
+
 def test_narrow_tables_are_kept_empty_ones_are_no_loss_and_texts_are_named(convert, tmp_path):
     more = {
         "Light.csv": "time,seconds_elapsed,lux\n1600000000100000000,0.1,120\n1600000000200000000,0.2,121\n",

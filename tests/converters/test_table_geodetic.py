@@ -12,7 +12,7 @@ from imutool.converters import table
 from imutool.recording.message_log import MessageLog
 
 T_S = np.arange(6000) / 100.0
-EVERY = slice(None, None, 10)
+EVERY, SAME_AXES = slice(None, None, 10), np.eye(3)
 A_M, F = 6_378_137.0, 1.0 / 298.257223563  # of WGS 84
 LATITUDE, LONGITUDE, HEIGHT_M = np.radians(55.0), np.radians(179.9995), 120.0  # by the date line
 ANGLES = np.stack([0.3 * np.sin(0.9 * T_S), 0.2 * np.sin(1.3 * T_S), 0.4 * np.sin(0.7 * T_S)], axis=1)  # roll, pitch, yaw
@@ -34,19 +34,33 @@ def rows(*values: np.ndarray) -> str:
 STATED = "latitude [{0}],longitude [{0}],altitude [m]"
 
 
-def recorded(folder: Path, unit: str, down: float, head: str = STATED, name: str = "groundtruth") -> MessageLog:
-    """Log of an IMU next to angles of another table; `down` is 1 where the z axis of their world points down."""
-    rotation = Rotation.from_euler("ZYX", ANGLES[:, ::-1])
-    turns = (rotation[:-1].inv() * rotation[1:]).as_rotvec() * 100.0
-    force = rotation.inv().apply([0.0, 0.0, -9.81 * down])
+def recorded(
+    folder: Path,
+    unit: str,
+    down: float,
+    head: str = STATED,
+    name: str = "groundtruth",
+    *,
+    axes: np.ndarray = SAME_AXES,
+    tilt: float = 1.0,
+    yaw: str = "yaw",
+) -> MessageLog:
+    """Log of an IMU next to angles of another table; `down` is 1 where the z axis of their world points down.
+
+    `axes` has the IMU's axes in its rows, in those of the angles' body, and `tilt` is the share of roll and pitch.
+    """
+    angles = ANGLES * [tilt, tilt, 1.0]
+    rotation = Rotation.from_euler("ZYX", angles[:, ::-1])
+    turns = (rotation[:-1].inv() * rotation[1:]).as_rotvec() @ axes.T * 100.0
+    force = rotation.inv().apply([0.0, 0.0, -9.81 * down]) @ axes.T
     latitude, longitude = LATITUDE + NED[:, 0] / 6.37e6, LONGITUDE + NED[:, 1] / (6.39e6 * np.cos(LATITUDE))
     folder.mkdir()
     imu = "time [s],gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s],acc_x [m/s^2],acc_y [m/s^2],acc_z [m/s^2]\n"
     (folder / "imu.csv").write_text(imu + rows(T_S, np.concatenate([turns, turns[-1:]]), force))
     size = {"deg": 180.0 / np.pi, "rad": 1.0}[unit]
     wrapped = (longitude + np.pi) % (2.0 * np.pi) - np.pi
-    truth = [T_S, latitude * size, wrapped * size, HEIGHT_M - NED[:, 2], *ANGLES.T * 180.0 / np.pi]
-    names = f"time [s],{head.format(unit)},roll [deg],pitch [deg],yaw [deg]\n"
+    truth = [T_S, latitude * size, wrapped * size, HEIGHT_M - NED[:, 2], *angles.T * 180.0 / np.pi]
+    names = f"time [s],{head.format(unit)},roll [deg],pitch [deg],{yaw} [deg]\n"
     (folder / f"{name}.csv").write_text(names + rows(*(column[EVERY] for column in truth)))
     (sequence,) = table.sequences(folder)
     return table.read_sequence(sequence)
@@ -66,6 +80,18 @@ def test_latitude_longitude_and_height_are_positions_of_the_angles_beside_them(t
         Rotation.from_euler("ZYX", ANGLES[EVERY, ::-1]).inv().apply([0.0, 0.0, -9.81])
     )
     np.testing.assert_allclose(force, np.tile([0.0, 0.0, 9.81], (len(force), 1)), atol=1e-9)
+
+
+@pytest.mark.parametrize("tilt", [1.0, 0.1])  # of a drone and of a car
+@pytest.mark.parametrize(
+    ("axes", "yaw"), [([[1, 0, 0], [0, -1, 0], [0, 0, -1]], "hdg"), ([[0, 1, 0], [1, 0, 0], [0, 0, -1]], "Azi")]
+)
+def test_an_imu_with_other_axes_than_the_angles_from_north_leaves_them_their_positions(tmp_path, axes, yaw, tilt):
+    """Forward, left, up, as in ROS, and right, forward, up, as NovAtel's; the angles are of forward, right, down."""
+    log = recorded(tmp_path / "car", "deg", 1.0, axes=np.array(axes), tilt=tilt, yaw=yaw)
+    enu = NED[EVERY][:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    np.testing.assert_allclose(log.poses["/ground_truth/pose"].p_wb, enu, atol=0.5)  # of the radii above
+    assert any("are north, east and down" in note for note in log.remarks.notes)
 
 
 def test_angles_in_another_world_keep_no_positions_of_this_one(tmp_path):

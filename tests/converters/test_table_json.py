@@ -188,3 +188,26 @@ def test_not_a_number_as_python_writes_it_is_a_missing_value(tmp_path, lines):
     assert len(log.scalars["/temperature"]) == len(rows[::3])
     with pytest.raises(DataError, match="begins as JSON and cannot be read"):
         read(tmp_path / "cut.json", json.dumps(rows)[:-20].replace("},", ","))
+
+
+def test_lines_of_json_in_a_folder_are_a_table_and_have_true_poses_beside_them(tmp_path):
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    readings = [
+        {"time": t / 1000 + late, "sensor": {"type": name, "values": values}}
+        for t, g, a in SAMPLES
+        for name, values, late in (("gyroscope", g, 0.0), ("accelerometer", a, 0.001))
+    ]
+    poses = [
+        {"time": t / 1000, "position": axes([0.0, 0.0, t / 500]), "orientation": {"w": 1.0, **axes([0.0] * 3)}}
+        for t, *_ in SAMPLES
+    ]
+    (folder / "data.jsonl").write_text("".join(json.dumps(row) + "\n" for row in readings))
+    (folder / "calibration.json").write_text(json.dumps({"cameras": [{"focalLengthX": 1000.0}]}))
+    (alone,) = table.sequences(folder)
+    assert alone.path == folder / "data.jsonl"
+    (folder / "groundtruth.jsonl").write_text("".join(json.dumps(row) + "\n" for row in poses))
+    (found,) = table.sequences(folder)
+    log = table.read_sequence(found, mapping={"gyro_unit": "rad/s"})
+    assert log.kinds == {"/ground_truth/pose": "truth"}
+    assert len(log.imus["/imu0"]) >= COUNT - 1

@@ -18,7 +18,7 @@ from imutool.recording import Imu, interpolate
 from ..text.delimited import Columns
 from ..text.names import name_and_unit, split_name
 from .map import Entries
-from .rotations import UP, rotations, seconds_of, up_share
+from .rotations import UP, body_by_motion, rotations, seconds_of, up_share
 from .units import ANGLE_SI, POSITION_SI
 
 SEMI_MAJOR_M, ECCENTRICITY_SQUARED = 6_378_137.0, 6.69437999014e-3  # of WGS 84
@@ -63,7 +63,9 @@ def in_their_world(columns: Columns, entries: Entries, position: list[str], cloc
     name = split_name(position[0].rpartition("/")[2])[0] if position else ""
     if not name.startswith((LOCAL, EASTING)):
         return position, ""
-    share = up_share(columns, entries, rotations(columns, entries), seconds_of(columns, clock), np.eye(3))
+    q_wxyz = rotations(columns, entries)
+    body = body_by_motion(columns, entries, q_wxyz, clock)  # of angles from north: forward, right, down, whatever the IMU's
+    share = up_share(columns, entries, q_wxyz, seconds_of(columns, clock), body)
     if share > UP and name == EASTING:
         return position, ""
     if share > UP and "quaternion_wxyz" in entries:

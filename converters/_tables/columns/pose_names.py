@@ -23,7 +23,7 @@ ANGLES = (
     (r"(.*_)?(euler|rpy|angles?)_?(angles?_?)?(?P<axis>[xyz012])(_?(deg|rad)[a-z]*)?", "xyz"),
 )
 GREEK = {"phi": "roll", "theta": "pitch", "psi": "yaw"}
-HEADING = r"((compass|true|magnetic)_)?(heading|azimuth)"  # a yaw
+HEADING = r"((compass|true|magnetic)_)?(heading|hdg|azimuth|azi)"  # a yaw
 POSITION = r"((t|p|(processed_?)?pos|positions?|translations?|trans|[pr]_[a-z]{2}(_[a-z]{1,2})?)_?)?(?P<axis>[xyz012])"
 POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (POSITION, "xyz"),

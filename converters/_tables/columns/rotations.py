@@ -120,6 +120,18 @@ def up_share(
     return float(mean[2] / np.linalg.norm(mean))
 
 
+def body_by_motion(
+    columns: Columns, entries: Entries, q_wxyz: Float64[np.ndarray, "n 4"], clock: tuple[str, str]
+) -> Float64[np.ndarray, "3 3"]:
+    """Rotation from the gyro's axes to the body of poses, by their turns; none where the axes are the same, or not shown."""
+    gyro, at_s = _GyroTurns.of(columns, entries), seconds_of(columns, clock)
+    for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
+        turn = _turns_alike(gyro, q_wxyz, at_s - delay_s, span_s)
+        if turn.correlation > SURE:
+            return np.eye(3) if turn.same_axes > SURE else turn.turn
+    return np.eye(3)
+
+
 def matrix_by_motion(columns: Columns, entries: Entries, nine: list[str], clock: tuple[str, str]) -> tuple[list[str], bool]:
     """Nine columns of a matrix or its transpose that turns as the gyro; whether it shows which."""
     candidates = nine, [nine[place] for place in (0, 3, 6, 1, 4, 7, 2, 5, 8)]

@@ -45,7 +45,7 @@ MAX_TABLES = 40  # of one recording
 MAX_NAMED = 5  # of tables that are left out
 DATA_FILE = "data.hdf5"  # of RoNIN
 logger = logging.getLogger(__package__)  # whose records `_unpacking` renames
-TEXTS = ".csv", ".txt", ".tsv", ".dat", ".log", ".tum", ".json"
+TEXTS = ".csv", ".txt", ".tsv", ".dat", ".log", ".tum", ".json", ".jsonl", ".ndjson"
 ENDINGS = *TEXTS, ".mat", ".npz", ".npy", ".parquet", ".feather", ".arrow", ".h5", ".hdf5", ".xlsx", ".xls"
 
 
