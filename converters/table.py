@@ -43,9 +43,9 @@ from ._tables.columns.map import (
     within_groups,
 )
 from ._tables.columns.motion import settle_accel_unit
-from ._tables.columns.pose_names import why_no_poses
+from ._tables.columns.pose_names import rotations_named, why_no_poses
 from ._tables.columns.propose import propose, without_copies
-from ._tables.columns.rotations import known_rotations, rotations_named, unit_by_poses
+from ._tables.columns.rotations import known_rotations, unit_by_poses
 from ._tables.columns.times import COUNTED, begun_at_zero, count_times
 from ._tables.columns.units import ACCEL_SI, GYRO_SI, POSITION_SI, unit_doubts
 from ._tables.files.formats import kind_of, load

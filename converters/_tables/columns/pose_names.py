@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
-from ..text.delimited import Columns
+import numpy as np
+
+from imutool.array_types import Float64
+from imutool.geometry import quaternion
+
+from ..text.delimited import Columns, matrix_columns
 from ..text.names import DIGITS, TIME_WORDS, group_of, leaf_of, split_name
 from .geodetic import EASTING, LOCAL
+from .map import TableMap, vectors_named
+from .rotations import of_matrices
+from .units import ANGLE_SI
 
 TRUE_GROUPS = (
     r"(data_?)?(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)(_?data)?\d*"
@@ -147,3 +156,14 @@ def _every(pattern: str, leaves: dict[str, str], axes: Sequence[str]) -> list[li
             axis = match["axis"].translate(DIGITS) if "x" in axes else match["axis"]
             found.setdefault(leaf[: match.start("axis")], {})[axis] = column
     return [[columns[axis] for axis in axes] for columns in found.values() if {*columns} == {*axes}]
+
+
+def rotations_named(columns: Columns, table: TableMap, where: Path) -> Float64[np.ndarray, "n 4"]:
+    """Quaternions (wxyz) of the columns that the map names for the poses."""
+    if table.quaternion_wxyz:
+        return vectors_named(columns, table.quaternion_wxyz, 1.0, 0.0, where)
+    if table.roll_pitch_yaw:
+        angles = vectors_named(columns, table.roll_pitch_yaw, ANGLE_SI[table.roll_pitch_yaw_unit], 0.0, where)
+        return quaternion.of_roll_pitch_yaw(angles)
+    nine = matrix_columns(table.rotation_matrix)
+    return of_matrices(vectors_named(columns, nine, 1.0, 0.0, where).reshape(-1, 3, 3), where)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -15,8 +15,8 @@ from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording import interpolate
 
-from ..text.delimited import Columns, matrix_columns
-from .map import Entries, TableMap, vectors_named
+from ..text.delimited import Columns
+from .map import Entries
 from .units import ANGLE_SI, GYRO_SI, TIME_NS, are_unsigned_counts
 
 SPAN_S, LONG_SPAN_S = 0.1, 0.3  # over which turns are compared; over the second, noise of the poses is a smaller part
@@ -86,10 +86,10 @@ def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock:
     best, is_shown = _way_by_motion(columns, entries, candidates, clock)
     if best is None:
         return [], ""
-    gyro, at_s, other = _GyroTurns.of(columns, entries), seconds_of(columns, clock), 1 - best
+    at_s, other = seconds_of(columns, clock), 1 - best
     pair = candidates[best], candidates[other] * INVERSE
-    for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
-        own, inverse = turns = [_turns_alike(gyro, way, at_s - delay_s, span_s) for way in pair]
+    for delay_s, turns in _trials(columns, entries, pair, clock):
+        own, inverse = turns
         if min(own.correlation, inverse.correlation) > SURE:
             named = zip(pair, turns, strict=True)
             up = [up_share(columns, entries, way, at_s - delay_s, turn.turn) > UP for way, turn in named]
@@ -123,10 +123,8 @@ def up_share(
 def body_by_motion(
     columns: Columns, entries: Entries, q_wxyz: Float64[np.ndarray, "n 4"], clock: tuple[str, str]
 ) -> Float64[np.ndarray, "3 3"]:
-    """Rotation from the gyro's axes to the body of poses, by their turns; none where the axes are the same, or not shown."""
-    gyro, at_s = _GyroTurns.of(columns, entries), seconds_of(columns, clock)
-    for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
-        turn = _turns_alike(gyro, q_wxyz, at_s - delay_s, span_s)
+    """Rotation from the gyro's axes to the body of poses; none where both turn alike."""
+    for _, (turn,) in _trials(columns, entries, [q_wxyz], clock):
         if turn.correlation > SURE:
             return np.eye(3) if turn.same_axes > SURE else turn.turn
     return np.eye(3)
@@ -148,9 +146,8 @@ def _way_by_motion(
     A quaternion in the other order is the inverse rotation in other frames, as is the transpose of a matrix. Motion about one
     or two axes fits both. Then the reading that turns about the gyro's own axes counts, or else the first.
     """
-    gyro, at_s, fits_both = _GyroTurns.of(columns, entries), seconds_of(columns, clock), False
-    for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
-        turns = [_turns_alike(gyro, way, at_s - delay_s, span_s) for way in candidates]
+    fits_both = False
+    for delay_s, turns in _trials(columns, entries, candidates, clock):
         for found in ([turn.correlation for turn in turns], [turn.same_axes for turn in turns]):
             best = int(np.argmax(found))
             if found[best] > SURE and _is_clear(found[best], min(found)):
@@ -168,13 +165,11 @@ def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock
         (unit, yaw): {"roll_pitch_yaw": [*three[:2], yaw + three[2]], "roll_pitch_yaw_unit": unit}
         for unit, yaw in product(_angle_units(columns, three), ("", "-"))
     }
-    turns = {way: rotations(columns, named) for way, named in candidates.items()}
-    gyro, at_s = _GyroTurns.of(columns, entries), seconds_of(columns, clock)
+    turned = [rotations(columns, named) for named in candidates.values()]
     size = GYRO_SI.get(str(entries.get("gyro_unit", "")), 0.0)
-    for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
+    for _, turns in _trials(columns, entries, turned, clock):
         found = {}
-        for way, q_wxyz in turns.items():
-            turn = _turns_alike(gyro, q_wxyz, at_s - delay_s, span_s)
+        for way, turn in zip(candidates, turns, strict=True):
             is_alike = not size or 1.0 / MAX_OFF < turn.slope / size < MAX_OFF
             found[way] = turn.correlation if is_alike else 0.0
         unit, yaw = max(found, key=lambda way: found[way])
@@ -184,9 +179,17 @@ def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock
     return {}
 
 
-def _delays(entries: Entries, clock: tuple[str, str]) -> list[float]:
-    """Delays between poses and gyro to try, the smallest first; less in rows of the IMU, which may be of another device."""
-    return [delay_s for delay_s in DELAYS_S if clock[0] != entries["time"] or abs(delay_s) <= MAX_IN_ROWS_S]
+def _trials(
+    columns: Columns, entries: Entries, candidates: Sequence[Float64[np.ndarray, "n 4"]], clock: tuple[str, str]
+) -> Iterator[tuple[float, list[_Alike]]]:
+    """Delays between poses and gyro, the smallest first, and how far each candidate then turns as the gyro.
+
+    Delays are less in rows of the IMU, which may be of another device.
+    """
+    gyro, at_s = _GyroTurns.of(columns, entries), seconds_of(columns, clock)
+    delays = (delay_s for delay_s in DELAYS_S if clock[0] != entries["time"] or abs(delay_s) <= MAX_IN_ROWS_S)
+    for delay_s, span_s in product(delays, SPANS_S):
+        yield delay_s, [_turns_alike(gyro, way, at_s - delay_s, span_s) for way in candidates]
 
 
 def _is_clear(correlation: float, other: float) -> bool:
@@ -229,17 +232,6 @@ def rotations(columns: Columns, entries: Entries) -> Float64[np.ndarray, "n 4"]:
         is_rotation &= np.linalg.det(np.where(is_rotation[:, None, None], matrices, 0.0)) > 0.0
         return of_matrices(np.where(is_rotation[:, None, None], matrices, 0.0))
     return columns.side_by_side(entries["quaternion_wxyz"])
-
-
-def rotations_named(columns: Columns, table: TableMap, where: Path) -> Float64[np.ndarray, "n 4"]:
-    """Quaternions (wxyz) of the columns that the map names for the poses."""
-    if table.quaternion_wxyz:
-        return vectors_named(columns, table.quaternion_wxyz, 1.0, 0.0, where)
-    if table.roll_pitch_yaw:
-        angles = vectors_named(columns, table.roll_pitch_yaw, ANGLE_SI[table.roll_pitch_yaw_unit], 0.0, where)
-        return quaternion.of_roll_pitch_yaw(angles)
-    nine = matrix_columns(table.rotation_matrix)
-    return of_matrices(vectors_named(columns, nine, 1.0, 0.0, where).reshape(-1, 3, 3), where)
 
 
 class _GyroTurns(NamedTuple):
