@@ -71,8 +71,10 @@ def with_form_of_low_pass(base: Fit, named: Sequence[Effect]) -> Fit:
     for k, (effect, theta) in enumerate(base.chosen):
         if effect.name not in LOW_PASSES:
             continue
-        if {RATE, SMOOTHING} & {*effect.parameters}:  # an effect that came in since may explain what its rate did
+        if {RATE, SMOOTHING} & {*effect.parameters}:  # another effect that came in since may explain what its rate did
             others, analog = (*base.chosen[:k], *base.chosen[k + 1 :]), [of for of in named if of.key == effect.key]
+            if all(other.name in (*LOW_PASSES, "clock_offset") for other, _ in others):
+                continue
             trial = min((fit(logs, (*others, (of, theta[:-1])), near=base) for of in analog), key=form_bic, default=base)
             if form_bic(trial) < form_bic(base):
                 return with_form_of_low_pass(trial, named)
