@@ -227,11 +227,15 @@ def progress(what: str, verbose: bool, quiet: bool) -> Iterator[NamedProgress]:
     with Progress(*columns, TextColumn("{task.fields[word]}"), console=err, transient=True, disable=not shown) as bar:
         task = bar.add_task(what, total=None, word="")
 
+        before = ""
+
         def tell(done: int, total: int, word: str) -> None:
+            nonlocal before
             short = plain(word) if len(word) <= room else f"{plain(word)[: room - 1]}…"
             bar.update(task, completed=done, total=total, word=short)
-            if word:
+            if word not in ("", before):
                 logger.info("%s %s", what, word)
+            before = word or before
 
         try:
             yield tell

@@ -345,6 +345,13 @@ def test_without_a_terminal_stderr_has_no_empty_line_of_the_progress(logs: Path,
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_a_verbose_line_of_progress_is_not_repeated_while_nothing_changes(capsys: pytest.CaptureFixture[str]) -> None:
+    with terminal.progress("Fleet", verbose=True, quiet=False) as tell:
+        for done, word in ((1, "1 of 2 done"), (1, "1 of 2 done"), (1, ""), (2, "2 of 2 done")):
+            tell(done, 2, word)
+    assert [line.split("Fleet ")[1] for line in capsys.readouterr().err.splitlines()] == ["1 of 2 done", "2 of 2 done"]
+
+
 def test_nothing_is_folded_where_nobody_looks_at_a_terminal(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
