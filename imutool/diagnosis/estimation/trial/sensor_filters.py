@@ -72,12 +72,8 @@ def _with_filters(base: Fit, lags: Sequence[int], named: Mapping[str, Effect], o
         filters = [named.get(f"{order}:{sensor}") for sensor in sensors]
         rest = [lag_s[sensor] for sensor in SENSORS if sensor not in sensors] or [0.5 * min(lag_s.values())]
         clock_s = rest[0] if with_clock else 0.0
-        own_s = [lag_s[sensor] - clock_s for sensor in sensors]
+        own_s = [max(lag_s[sensor] - clock_s, MIN_LAG_S) for sensor in sensors]
         clock = [(named[OFFSET], np.array([-clock_s]))] if with_clock and OFFSET in named else []
-        each = [
-            (of, np.array([cutoff_hz(of, damping, max(s, MIN_LAG_S)), *damping]))
-            for of, s in zip(filters, own_s, strict=True)
-            if of and s >= 0.0  # no filter looks ahead
-        ]
+        each = [(of, np.array([cutoff_hz(of, damping, s), *damping])) for of, s in zip(filters, own_s, strict=True) if of]
         if len(each) == len(sensors) and len(clock) == with_clock:
             yield (*others, *clock, *each)
