@@ -123,7 +123,7 @@ def up_share(
 def body_by_motion(
     columns: Columns, entries: Entries, q_wxyz: Float64[np.ndarray, "n 4"], clock: tuple[str, str]
 ) -> Float64[np.ndarray, "3 3"]:
-    """Rotation from the gyro's axes to the body of poses, by their turns; none where the axes are the same, or not shown."""
+    """Rotation from the gyro's axes to the body of poses; none where both are one or not shown."""
     gyro, at_s = _GyroTurns.of(columns, entries), seconds_of(columns, clock)
     for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
         turn = _turns_alike(gyro, q_wxyz, at_s - delay_s, span_s)
