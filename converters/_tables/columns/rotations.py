@@ -123,7 +123,7 @@ def up_share(
 def body_by_motion(
     columns: Columns, entries: Entries, q_wxyz: Float64[np.ndarray, "n 4"], clock: tuple[str, str]
 ) -> Float64[np.ndarray, "3 3"]:
-    """Rotation from the gyro's axes to the body of poses; none where both turn alike."""
+    """Rotation from the gyro's axes to the body of poses; none where both are one or not shown."""
     for _, (turn,) in _trials(columns, entries, [q_wxyz], clock):
         if turn.correlation > SURE:
             return np.eye(3) if turn.same_axes > SURE else turn.turn
