@@ -61,10 +61,10 @@ MIN_SPEED_M_S, MIN_PIVOT_M = 1.0, 1e-3  # of the filter: an arm and a tight boun
 MAX_OF_GUESS = np.array([3.0] * 3 + [MAX_DEVIATIONS] * 3)  # the same where few sessions leave the prior's width to a guess
 MIN_EVIDENCE = -40.0  # log-likelihood of the model against none
 DEPENDENT = 2.0  # ratio of the shown bias's deviation to the filter's, which takes velocities for independent; a hand circles
-ROOM_M = 8.0  # deviation of a position every half second; three metres that last some seconds are the same
+ROOM_M = 8.0  # deviation of a position every half second, as if each were independent; as three metres for some seconds
 MAX_IN_ROOM = 0.45  # mean chi-square of three: 0.4 or less in rooms and halls, from 4 on in vehicles; walkers lie between
-MAX_STD, OF_FILTER = 0.5, 0.5  # deviation by the filter that shows a share; part of it beside Newey and West's
-SURE_GYRO = {"gyro_density": 2e-4, "gyro_scale": 1e-4}  # rad/s/sqrt(Hz): its errors are in question, so they are no noise
+MAX_STD, OF_FILTER = 0.5, 0.5  # of the filter's deviation: its maximum for a share, and its part beside Newey and West's
+SURE_GYRO = {"gyro_density": 2e-4, "gyro_scale": 1e-4}  # its errors are in question: the filter must not take them for noise
 HALF, MAX_SHARE = 0.5, 1.5  # of a correction: between them it does more good than harm
 MIN_SHARE = -2.0  # below, the log lacks so much else that the correction makes it worse by less than half
 MIN_SHOWN = 0.005  # deviation of a share that a percentage shows
@@ -199,7 +199,10 @@ def _filtered(samples: Sequence[Samples], priors: Sequence[BiasPrior], **changes
 
 
 def _share(samples: Sequence[Samples], unknown: BiasPrior) -> Share:
-    """Share of a correction that a log shows, from samples without it and with it and a prior of an unknown bias."""
+    """Share of a correction that a log shows; the samples are those without it and those with it.
+
+    The position shows it where one of both stays in a room, and elsewhere the velocity.
+    """
     if all(np.array_equal(*columns) for columns in zip(*samples, strict=True)):
         return Share(0.0, math.inf, math.inf)
     in_room = _filtered(samples, [unknown] * 2, room_m=ROOM_M, **SURE_GYRO)

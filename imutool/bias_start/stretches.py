@@ -56,7 +56,7 @@ class Stretch(NamedTuple):
 
 
 def unusual_gravity(accel: Rows3, bias: Float64[np.ndarray, "3"] | None = None) -> str:
-    """Sentence on a median or a bias of the specific force that is not gravity's; else empty."""
+    """Sentence on a specific force that is not gravity, by its median or its bias; else empty."""
     size, off = float(quantile(np.linalg.norm(accel, axis=1), 0.5)), 0.0 if bias is None else float(np.linalg.norm(bias))
     low, high = (share * GRAVITY_M_S2 for share in GRAVITY_RANGE)
     if not low <= size <= high:

@@ -1,4 +1,4 @@
-"""Innovations of velocity: the share of a correction they ask for, stops they refute."""
+"""Innovations of velocity or position: the share of a correction, and stops they refute."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ TURNS = 25.0  # chi-square of a rate against the bias so far, which no vibration
 
 
 class Innovations(NamedTuple):
-    """Innovations of velocity by block in body axes, and their covariances."""
+    """Innovations by block in body axes, and their covariances.
+
+    They are of the velocity, or of the position where the filter has a bound for it (`room_m`).
+    """
 
     e: Float64[np.ndarray, "m 3"]
     S: Float64[np.ndarray, "m 3 3"]
@@ -39,7 +42,7 @@ class Innovations(NamedTuple):
 
 
 def innovations(steps: Iterable[Step]) -> Innovations:
-    """Innovations of each step's velocity, in body axes; none of a step over a gap."""
+    """Innovations of each step, in body axes; none of a step over a gap."""
     measured = [(step.expected.R_wb.T, *step.innovation) for step in steps if step.innovation is not None]
     R_bw, v, S = (np.array([row[k] for row in measured]).reshape(-1, *shape) for k, shape in enumerate(((3, 3), (3,), (3, 3))))
     return Innovations((R_bw @ v[..., None])[..., 0], R_bw @ S @ R_bw.transpose(0, 2, 1))

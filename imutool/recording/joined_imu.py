@@ -158,7 +158,7 @@ def _together(
 def _resampled(
     t_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n 3"], start: int, first: int, last: int
 ) -> Float64[np.ndarray, "c 3"]:
-    """Values at equal steps from `start` on, of which they are the steps from `first` to `last`, smoothed."""
+    """Smoothed values at the equal steps `first` to `last`, which count from the time `start`."""
     t, grid, mean = (t_ns - start) * 1e-9, STEP_S * np.arange(first, last), np.full(SMOOTHED, 1.0 / SMOOTHED)
     smoothed = np.empty((last - first, 3))
     for column, out in zip(values.T, smoothed.T, strict=True):

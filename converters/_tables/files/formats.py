@@ -164,7 +164,7 @@ def _load_text(path: Path, columns: Columns) -> None:
 
 
 def _is_of_program(start: str) -> bool:
-    """Whether a text is no table as it stands, but one that a program wrote in its own way, by its first lines."""
+    """Whether the first lines of a text show the own format of a program, as of a motion capture or `ros2 topic echo`."""
     of_program = is_mocap(start) or of_labview(start) or of_vectornav(start, Columns()) or has_signals(start)
     return bool(of_program or of_echo(start)[0] or as_table(start)[0] or names_sensors(start))
 
