@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64, Int64, Shaped, UInt8, Vectors
+from imutool.array_types import Bool, Float64, Int64, Shaped, UInt8
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, ros2_definition, schemas
 from imutool.mcap_io.codec.decode import (
@@ -26,7 +26,7 @@ from imutool.mcap_io.codec.decode import (
     named,
 )
 from imutool.mcap_io.codec.formats.objects import OF_OBJECTS
-from imutool.mcap_io.codec.joined_imu import JoinedImu, whole_of
+from imutool.mcap_io.codec.joined_imu import JoinedImu, Vectors, whole_of
 from imutool.mcap_io.codec.messages import Messages, Rows
 from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
 from imutool.mcap_io.codec.transforms import Transforms, listed_poses
