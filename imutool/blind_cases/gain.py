@@ -20,12 +20,12 @@ from imutool.blind_cases.envelope import ConcealedTruth, Rms
 from imutool.blind_cases.motion import DEGREE, Motion, smoother
 from imutool.blind_cases.scene import RATE_HZ, Scene
 from imutool.recording import Recording, seconds
+from imutool.units import SENSORS
 
 EDGE_S = 1.0  # at both ends, where filters settle and shifted clocks leave the log
 WITHOUT_MISFIT = {"quantization", "dropped_samples", "timestamp_jitter"}  # act on noise and stamps
 NOT_SIMULATED = {"reference_error", "vibration", "unknown"}  # their parameters alone do not say the signal
 MIN_MISFIT = 0.02  # of the noise's power: with less than that a signal has no gain worth a ratio
-SIGNALS = ("gyro", "accel")
 BOTH = ("both", "imu")
 
 
@@ -110,7 +110,7 @@ def _model(name: str, driver: str, equation: str, values: Mapping[str, float]) -
     if name == "driven":
         sensor, _, axis = equation.partition(" ")[0].partition(".")
         topic = next((topic for topic in catalogue.TOPICS if driver == topic or driver.startswith(f"{topic}.")), None)
-        if topic is None or sensor not in SIGNALS or axis not in AXES or not {"gain", "lag"} <= set(values):
+        if topic is None or sensor not in SENSORS or axis not in AXES or not {"gain", "lag"} <= set(values):
             return None
         return catalogue.follower(topic, AXES.index(axis) + 3 * (sensor == "accel")), np.array([values["gain"], values["lag"]])
     if name in NOT_SIMULATED or name not in CATALOGUE or (name == "low_pass" and "f_c" not in values):
@@ -148,7 +148,7 @@ def reported_gain(truth: ConcealedTruth, found: Findings, findings: Sequence[Rep
     Achievable is a reduction down to the recording's own noise: that of the simulation can be smoothed away.
     """
     shares, weights = [], []
-    for k, signal in enumerate(SIGNALS):
+    for k, signal in enumerate(SENSORS):
         best: Rms = truth.achievable[signal]
         weight = (best.rms_before / best.rms_after) ** 2 - 1.0
         if weight > MIN_MISFIT:
