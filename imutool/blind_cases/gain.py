@@ -20,12 +20,12 @@ from imutool.blind_cases.envelope import ConcealedTruth, Rms
 from imutool.blind_cases.motion import DEGREE, Motion, smoother
 from imutool.blind_cases.scene import RATE_HZ, Scene
 from imutool.recording import Recording, seconds
-from imutool.units import SENSORS
 
 EDGE_S = 1.0  # at both ends, where filters settle and shifted clocks leave the log
 WITHOUT_MISFIT = {"quantization", "dropped_samples", "timestamp_jitter"}  # act on noise and stamps
 NOT_SIMULATED = {"reference_error", "vibration", "unknown"}  # their parameters alone do not say the signal
 MIN_MISFIT = 0.02  # of the noise's power: with less than that a signal has no gain worth a ratio
+SIGNALS = ("gyro", "accel")
 BOTH = ("both", "imu")
 
 
@@ -83,10 +83,9 @@ def explained_gain(
 ) -> float | None:
     """Share of the misfit's power over the noise that findings explain.
 
-    Their parameters have the catalogue's names.
-
-    At most 1; below 0 where they make it worse. None where an effect cannot be simulated, there is none, or what is concealed
-    acts within `EDGE_S` of the ends alone, as a limit that the first second reaches.
+    Their parameters have the catalogue's names. At most 1; below 0 where they make it worse. None where an effect cannot be
+    simulated, there is none, or what is concealed acts within `EDGE_S` of the ends alone, as a limit that the first second
+    reaches.
     """
     shown = [effect for effect in truth.effects if effect.effect not in WITHOUT_MISFIT]
     known = [_model(e.effect, e.driver, e.equation, {k: p.value for k, p in e.parameters.items()}) for e in shown]
@@ -110,7 +109,7 @@ def _model(name: str, driver: str, equation: str, values: Mapping[str, float]) -
     if name == "driven":
         sensor, _, axis = equation.partition(" ")[0].partition(".")
         topic = next((topic for topic in catalogue.TOPICS if driver == topic or driver.startswith(f"{topic}.")), None)
-        if topic is None or sensor not in SENSORS or axis not in AXES or not {"gain", "lag"} <= set(values):
+        if topic is None or sensor not in SIGNALS or axis not in AXES or not {"gain", "lag"} <= set(values):
             return None
         return catalogue.follower(topic, AXES.index(axis) + 3 * (sensor == "accel")), np.array([values["gain"], values["lag"]])
     if name in NOT_SIMULATED or name not in CATALOGUE or (name == "low_pass" and "f_c" not in values):
@@ -143,12 +142,11 @@ def _scene(truth: ConcealedTruth, sim: Recording) -> Scene:
 def reported_gain(truth: ConcealedTruth, found: Findings, findings: Sequence[ReportedFinding]) -> float | None:
     """Reported share of the achievable reduction of the residual's power.
 
-    Signals weighted by their misfit over the noise.
-
-    Achievable is a reduction down to the recording's own noise: that of the simulation can be smoothed away.
+    Signals weighted by their misfit over the noise. Achievable is a reduction down to the recording's own noise: that of the
+    simulation can be smoothed away.
     """
     shares, weights = [], []
-    for k, signal in enumerate(SENSORS):
+    for k, signal in enumerate(SIGNALS):
         best: Rms = truth.achievable[signal]
         weight = (best.rms_before / best.rms_after) ** 2 - 1.0
         if weight > MIN_MISFIT:

@@ -13,6 +13,7 @@ from imutool.blind_cases.catalogue import AXES, CATALOGUE
 from imutool.blind_cases.envelope import ConcealedEffect, ConcealedTruth, Location
 from imutool.blind_cases.gain import (
     BOTH,
+    SIGNALS,
     Findings,
     ReportedFinding,
     ReportedLocation,
@@ -23,7 +24,6 @@ from imutool.blind_cases.gain import (
 from imutool.errors import DataError
 from imutool.recording import Recording
 from imutool.report import Report, Section
-from imutool.units import SENSORS
 
 SCHEMA, FINDINGS_SCHEMA = "imutool.score/1", "imutool.diagnosis/1"
 IN_EVERY_LOG = {"gyro_bias", "accel_bias"}  # right, but never concealed
@@ -46,20 +46,16 @@ class LocationScore(Section, frozen=True):
 
 
 class ParameterScore(Section, frozen=True):
-    """Reported value of an identifiable parameter against the true one.
-
-    `sigmas`: error over the reported deviation; `percent`: error over the parameter's scale; `over_bound`: reported deviation
-    over the Cramér-Rao bound.
-    """
+    """Reported value of an identifiable parameter against the true one."""
 
     effect: str
     parameter: str
     true: float
     value: float
     std: float
-    sigmas: float | None
-    percent: float
-    over_bound: float | None
+    sigmas: float | None  # error over the reported deviation
+    percent: float  # error over the parameter's scale
+    over_bound: float | None  # reported deviation over the Cramér-Rao bound
 
 
 class Score(Report, frozen=True, kw_only=True, tag=SCHEMA):
@@ -169,7 +165,7 @@ def _reported(name: str, finding: ReportedFinding) -> tuple[float, float] | None
             return _finite(finding.parameters[candidate])
     sensor, _, axis = name.rpartition("_")
     waves = [(f"sin_{axis}", f"cos_{axis}"), (f"{sensor}_sin_{axis}", f"{sensor}_cos_{axis}")]
-    for names in waves if sensor in SENSORS else []:
+    for names in waves if sensor in SIGNALS else []:
         pair = [_finite(finding.parameters[wave]) for wave in names if wave in finding.parameters]
         sine, cosine = pair if len(pair) == 2 else (None, None)
         if sine is not None and cosine is not None and (names[0].startswith(sensor) or sensor == "accel"):
@@ -227,7 +223,7 @@ def _unreported(effect: ConcealedEffect, finding: ReportedFinding) -> list[str]:
 
 def _location_score(true: Location, located: Sequence[ReportedLocation]) -> LocationScore:
     seconds, axes = [], []
-    for signal, marks in zip(SENSORS, (true.gyro, true.accel), strict=True):
+    for signal, marks in zip(SIGNALS, (true.gyro, true.accel), strict=True):
         own = [place for place in located if place.signal in (signal, *BOTH)]
         if marks.localised:
             seconds += list(zip(marks.seconds, _covered(len(marks.seconds), true.window_s, own), strict=True))
