@@ -255,15 +255,12 @@ def model_samples(model: BiasModel, imu: Imu) -> Samples:
 
 
 class SmoothedBias(NamedTuple):
-    """Smoothed rest bias, time at rest, and what the log alone shows of the bias at its start.
-
-    `difference` is that bias minus the prior's mean, `variance` its variance: infinite where the log shows little.
-    """
+    """Smoothed rest bias, time at rest, and what the log alone shows of the bias at its start."""
 
     track: BiasTrajectory
     rested_s: float
-    difference: Vector6
-    variance: Vector6
+    difference: Vector6  # of that bias from the prior's mean
+    variance: Vector6  # of it: infinite where the log shows little
 
 
 def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> SmoothedBias:

@@ -1,9 +1,8 @@
 """Forward models of the effects that a blind case may conceal.
 
-They follow the catalogue's formulas.
-
-A model acts at its stage, in the order in which a signal passes them; `scene` has the order within one. Up to CONVERTER a
-signal is an array of six columns: gyro (rad/s), then accel (m/s²). The estimator has forward models of its own and uses none.
+They follow the catalogue's formulas. A model acts at its stage, in the order in which a signal passes them; `scene` has the
+order within one. Up to CONVERTER a signal is an array of six columns: gyro (rad/s), then accel (m/s²). The estimator has
+forward models of its own and uses none.
 """
 
 from __future__ import annotations

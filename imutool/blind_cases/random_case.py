@@ -1,6 +1,4 @@
-"""Random choice of what a blind case conceals.
-
-Sized so that an optimal estimator could see it.
+"""Random choice of what a blind case conceals, so large that an optimal estimator sees it.
 
 Sizes: `large` is the plausible size of the catalogue, `middle` a quarter of it, `small` 3.5 times the smallest that an optimal
 test sees (`information.detectable_misfit`), against the noise and against the most similar other effect. An effect that the

@@ -50,14 +50,11 @@ Load = Float64[np.ndarray, "3 11"]  # state of a slow drift, by time constant an
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """Signals, one row a sample: rad/s, m/s², derivatives, vibration power in (m/s²)².
-
-    `temperature` has the terms of the log's temperature in a training (`imutool.bias.temperature`).
-    """
+    """Signals, one row a sample: rad/s, m/s², derivatives, vibration power in (m/s²)²."""
 
     t_s: Float64[np.ndarray, " n"]
     columns: Float64[np.ndarray, "n 60"]
-    temperature: Float64[np.ndarray, "n 12"] | None = None
+    temperature: Float64[np.ndarray, "n 12"] | None = None  # its terms, in a training (`imutool.bias.temperature`)
 
     @property
     def gyro(self) -> Vectors:
