@@ -44,7 +44,7 @@ CLIPPED_PERCENT = 5.0
 
 
 def clipping(theta: Theta, size: float, signal: Rows6) -> Theta:
-    """Limits that clip the largest axis 5 % of the time at the plausible size, and less at a smaller."""
+    """Limits that clip the largest axis 5 % of the time at the plausible size, else less."""
     share = 100.0 - CLIPPED_PERCENT * size
     at = np.array([np.percentile(np.abs(signal[:, part]).max(axis=1), share) for part in (GYRO, ACCEL)])
     return np.where(theta < NO_LIMIT, at, NO_LIMIT)

@@ -196,7 +196,7 @@ def location(misfit: Rows6, sigma: Theta) -> Location:
 
 
 def achievable_rms(misfit: Rows6, sigma: Theta) -> dict[str, Rms]:
-    """RMS of real minus simulated samples by sensor without the bias: misfit and noise, noise alone."""
+    """RMS of real minus simulated samples by sensor, bias removed: with misfit, and of noise."""
     misfit = misfit - misfit.mean(axis=0)
     found = {}
     for name, part in (("gyro", GYRO), ("accel", ACCEL)):

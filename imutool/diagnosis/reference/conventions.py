@@ -28,7 +28,7 @@ CONSTANT = 0.1  # of the squares of the specific force: a bias and a tilt leave 
 
 
 def with_common_conventions(pairs: Sequence[Pair], of: str = "simulation") -> tuple[list[Pair], list[Finding]]:
-    """Recordings in the units and axes of their reference (`of`), and findings of those that differ."""
+    """Recordings in the units and axes of a reference, `of` by name; findings of what differs."""
     shown: dict[Sensor, _Convention] = {}
     for sensor in SENSORS:
         part = COLUMNS[sensor]
