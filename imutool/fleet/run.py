@@ -130,7 +130,7 @@ def run(
 
     Raises:
         ConfigError: no logs, no engine, or an `out` that holds results or cannot be written; a page or `json_to` likewise.
-        KeyboardInterrupt: the message says how to go on; no partial file is left.
+        KeyboardInterrupt: its note says how to go on; no partial file is left.
     """
     began = time.perf_counter()
     results.arrow()  # before the work, not after
@@ -164,8 +164,8 @@ def run(
         except BaseException as error:  # workers have been killed
             with suppress(ConfigError):  # of a store that is gone: the first error is raised
                 fleet.remove_partial()
-            if isinstance(error, KeyboardInterrupt):
-                raise KeyboardInterrupt(f"{progress.line()}; go on with `resume`") from error
+            if isinstance(error, (KeyboardInterrupt, SystemExit)):
+                error.add_note(f"{progress.line()}; go on with `resume`")
             raise
         if isinstance(target, Path):  # of workers that died; in a store another run may be at work
             fleet.remove_partial()

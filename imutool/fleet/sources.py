@@ -7,7 +7,6 @@ import fnmatch
 import logging
 import os
 import re
-import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cache
@@ -34,6 +33,7 @@ from imutool.file_location import (
 from imutool.fleet.journal import NAME as JOURNAL
 from imutool.fleet.targets import relative, shown
 from imutool.fleet.task import Source
+from imutool.mcap_io.storage.output_conflicts import folded
 
 logger = logging.getLogger(__name__)
 
@@ -95,7 +95,7 @@ def find(text: str, out: Location, *, bags: bool = False, once: bool = False) ->
             if unread:
                 raise ConfigError(f"cannot be read ({unread})", fix="See who may read it")
             name = relative(where, root)
-            before = taken.setdefault(unicodedata.normalize("NFC", name).casefold(), where)  # one file on some systems
+            before = taken.setdefault(folded(name), where)
             if before != where:
                 raise ConfigError(f"would be called {name} on some systems, and so would {before}", fix="Rename one of the two")
             place = to_location(where)
