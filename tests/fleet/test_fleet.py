@@ -430,6 +430,18 @@ def test_the_command_says_what_came_of_it(fleet: Path, tmp_path: Path) -> None:
     assert report["not_whole"][0]["source"] == str(fleet / "bad.mcap")
 
 
+def test_a_page_that_cannot_be_written_hides_nothing_that_was_done(fleet: Path, tmp_path: Path) -> None:
+    (fleet / "bad.mcap").write_bytes(b"no log")
+    words = ["fleet", "info", str(fleet), str(tmp_path / "out"), "--report", "/proc/page.html"]  # not even root makes a file there
+    done = CliRunner().invoke(load(), [*words, "--json", str(tmp_path / "fleet.json")])
+    assert done.exit_code == 3
+    assert f"{fleet / 'bad.mcap'}: " in done.stdout
+    assert "2 of 3 done, 1 failed" in done.stdout
+    assert "page.html" not in done.stdout
+    assert re.search(r"/proc/page.html: cannot be written .*, and go on with --resume", done.stderr)
+    assert json.loads((tmp_path / "fleet.json").read_text())["logs"] == 3
+
+
 def test_a_path_that_is_no_utf_8_is_told(fleet: Path, tmp_path: Path) -> None:
     odd = tmp_path / os.fsdecode(b"\xff")
     odd.symlink_to(fleet)
