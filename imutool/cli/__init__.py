@@ -11,9 +11,11 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from io import TextIOWrapper
-from typing import TYPE_CHECKING
+from types import FrameType
+from typing import TYPE_CHECKING, NoReturn
 
 from imutool.cli.overview import COMMANDS, MODULES, show
 
@@ -22,7 +24,8 @@ if TYPE_CHECKING:
 
 COMPLETION = "_IMUTOOL_COMPLETE"  # a shell asks for words; any command may be meant
 HALF_MADE = "RecordingStream.__del__"  # of Rerun: it fails where a Ctrl-C ended the stream's __init__
-WRONG_USAGE, INTERRUPTED, TERMINATED = 2, 130, 143  # what a shell reports of a program that SIGTERM ended
+WRONG_USAGE, INTERRUPTED = 2, 130
+ENDS = {129: "SIGHUP", 143: "SIGTERM"}  # by what a shell reports of a program that the signal ended
 
 
 def load(words: Sequence[str] = ()) -> App:
@@ -42,8 +45,7 @@ def main() -> None:
     os.environ.setdefault(
         "OPENBLAS_NUM_THREADS", "1"
     )  # the matrices are small: `diagnose` takes a fifth less, and ends no later
-    # A scheduler's SIGTERM would end the process where it stands, with its temporary files and parts of uploads left behind
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+    _end_by_signals()
     sys.unraisablehook = _unraisable
     gc.set_threshold(100_000)  # imports make objects that stay: the collector took a twelfth of a command's start
     atexit.register(gc.freeze)  # and at the end it would look at all of them again, which takes 45 ms of CPU
@@ -62,12 +64,15 @@ def main() -> None:
         from typer import Exit
 
         from imutool.cli.app import caught
+        from imutool.cli.terminal import tell_end
         from imutool.errors import was_interrupted
     except BaseException as error:  # Ctrl-C before there is anybody who could catch it in style
         from imutool.errors import was_interrupted
 
         if not was_interrupted(error):
             _leave_pipe(error)
+            if isinstance(error, SystemExit) and error.code in ENDS:
+                print(f"error: ended by {ENDS[error.code]}. Nothing was begun.", file=sys.stderr)
             raise
         print("error: interrupted. Nothing was begun.", file=sys.stderr)
         sys.exit(INTERRUPTED)
@@ -78,7 +83,23 @@ def main() -> None:
             if isinstance(end.__context__, Exit) and was_interrupted(end.__context__):
                 raise KeyboardInterrupt from end  # before the command began or after its end, where typer ends without a word
             _leave_pipe(end)
+            if end.code in ENDS:
+                with suppress(OSError):  # the terminal has gone
+                    tell_end(f"ended by {ENDS[end.code]}", end)
             raise
+
+
+def _end_by_signals() -> None:
+    """Let the signals of a scheduler and of a terminal that closes remove temporary files and parts of uploads first."""
+
+    def end(number: int, frame: FrameType | None) -> NoReturn:
+        if ENDS[128 + number] == "SIGHUP":  # a terminal sends it, and then its shell
+            signal.signal(number, signal.SIG_IGN)
+        sys.exit(128 + number)
+
+    for name in ENDS.values():
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN:  # as nohup sets it
+            signal.signal(getattr(signal, name), end)
 
 
 def _show() -> None:

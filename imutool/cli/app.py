@@ -22,14 +22,14 @@ from typer.models import CommandFunctionType
 from imutool import __version__, registry
 from imutool.cli.overview import ABOUT, fitted, show
 from imutool.cli.parameters import FOLDERS, Group, PlainValue, current, error_with_flags, flags, instead_of, with_flags
-from imutool.cli.terminal import log_to_stderr, plain, progress, say, stdout_for_one, tell_error, write_json
+from imutool.cli.terminal import log_to_stderr, plain, progress, say, stdout_for_one, tell_end, tell_error, write_json
 from imutool.errors import INTERRUPTED, PIPE_CLOSED, ConfigError, ImutoolError, redact, was_interrupted
 from imutool.file_location import first_bytes
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.report import NamedProgress, Report
 
-NOTHING_LEFT, MAKE_ROOM = "Nothing half-written is left", "Choose another place or make room"
+MAKE_ROOM = "Choose another place or make room"
 FIXES = {FileNotFoundError: "Look whether it is still there", PermissionError: "See who may read it, or write there"}
 
 
@@ -60,7 +60,8 @@ def caught() -> Iterator[None]:
     except ImutoolError as error:
         _fail(str(error), error.exit_code)
     except KeyboardInterrupt as interrupt:
-        _fail(f"interrupted. {str(interrupt) or NOTHING_LEFT}.", INTERRUPTED)
+        tell_end("interrupted", interrupt)
+        sys.exit(INTERRUPTED)
     except BrokenPipeError:
         _forget_stdout()
         sys.exit(PIPE_CLOSED)
@@ -71,7 +72,8 @@ def caught() -> Iterator[None]:
         _fail(f"{place}{error.strerror or error}. {FIXES.get(type(error), MAKE_ROOM)}.", ConfigError.exit_code)
     except Exception as error:
         if was_interrupted(error):
-            _fail(f"interrupted. {NOTHING_LEFT}.", INTERRUPTED)
+            tell_end("interrupted", error)
+            sys.exit(INTERRUPTED)
         raise
 
 
@@ -128,8 +130,6 @@ class Command(TyperCommand):
             values = ctx.params.values()
             typed = {str(word) for value in values for word in (value if isinstance(value, (list, tuple)) else (value,))}
             raise error_with_flags(error, flag_of, typed) from error
-        except KeyboardInterrupt as interrupt:
-            raise KeyboardInterrupt(with_flags(str(interrupt), flag_of)) from interrupt
 
     def _check(self, values: Mapping[str, Any], meta: Mapping[str, Any]) -> None:
         """Refuse outputs that would destroy something; on --resume a report of the run before may be replaced."""

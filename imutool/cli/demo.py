@@ -97,8 +97,9 @@ def run(
     settings = TrainSettings(steps=STEPS)
     try:
         train(training, model, method="neural_ode", settings=settings, overwrite=overwrite, progress=progress)
-    except KeyboardInterrupt as interrupt:  # it advises `resume`, which the demo has not
-        raise KeyboardInterrupt from interrupt
+    except (KeyboardInterrupt, SystemExit) as end:
+        end.__notes__ = []  # they advise `resume`, which the demo has not
+        raise
     say(f"4. Debiasing the one it has not seen, without its truth: {debiased}")
     debias(log, debiased, model=model, overwrite=overwrite)
     say("5. Measuring against the truth, drawing")

@@ -83,8 +83,11 @@ def _run(
             tell=tell,
             wording=with_flags,
         )
-    if not common.write(done.summary(), replace=resume):
-        _show(done, target, report)
+    if common.json_to != "-":
+        _show(done, target, report if done.page_error is None else None)
+    common.write(done.summary(), replace=resume)
+    if done.page_error is not None:
+        raise done.page_error
     raise typer.Exit(done.progress.exit_code)
 
 

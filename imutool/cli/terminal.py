@@ -73,6 +73,11 @@ def tell_error(message: str) -> None:
     say(redact(_cut(message, LONGEST)), "error", "bold red", to=err)
 
 
+def tell_end(how: str, end: BaseException) -> None:
+    """Print how a command ended too early; notes of the exception say how to go on."""
+    tell_error(f"{how}. {with_flags(' '.join(getattr(end, '__notes__', ()))) or 'Nothing half-written is left'}.")
+
+
 def _cut(text: str, longest: int) -> str:
     """Text without its middle, if it is longer."""
     return text if len(text) <= longest else f"{text[: longest // 2]} … {text[-longest // 2 :]}"

@@ -13,7 +13,7 @@ import numpy as np
 
 from imutool import __version__
 from imutool.array_types import Float64
-from imutool.file_location import Location
+from imutool.file_location import Location, is_file
 from imutool.fleet.results import MAX_ROWS, TROUBLE, Statistics
 from imutool.fleet.robots import FEWEST, Comparison, Outlier
 from imutool.fleet.task import Result, Settings
@@ -68,6 +68,14 @@ def write(
     with Target(path, overwrite=overwrite) as target:
         link = Links(path, out)
         target.write(html(results, settings, link=link, seconds=seconds, source=source, comparison=comparison).encode())
+
+
+def is_page(path: Location) -> bool:
+    """Whether a file is a page about a fleet."""
+    if not is_file(path):
+        return False
+    with path.open("rb") as file:
+        return b"<title>Fleet " in file.read(4096)
 
 
 def html(
@@ -245,8 +253,9 @@ def _histogram(axes: Any, values: Float64[np.ndarray, " n"], label: str, color: 
     span, largest = float(np.ptp(values)), float(np.abs(values).max())
     span = span if span > EQUAL * largest else largest or 1.0  # equal values: as wide as they are large
     first, last = values.min() - 0.05 * span, values.max() + 0.05 * span
+    first = max(first, 0.0) if values.min() >= 0.0 else first  # nothing stands below zero that may not be there
     axes.hist(values, bins=min(BINS, max(5, len(values) // 2)), range=(first, last), color=color, alpha=0.7)
-    axes.set(xlabel=label, ylabel="logs")
+    axes.set(xlabel=label, ylabel="logs", xlim=(first, last))
     axes.set_axisbelow(True)
     axes.locator_params(axis="x", nbins=5)
     axes.locator_params(axis="y", nbins=4, integer=True)

@@ -13,7 +13,8 @@ from pathlib import Path
 import msgspec
 
 from imutool.errors import LOST, ConfigError
-from imutool.file_location import Location, exists, is_file, to_location
+from imutool.file_location import Location, exists, to_location
+from imutool.fleet import page as pages
 from imutool.fleet import results
 from imutool.fleet.engine import BUG, Engine
 from imutool.fleet.journal import NAME as JOURNAL
@@ -26,7 +27,7 @@ from imutool.fleet.targets import page_name, partial_files, refuse_own, remove_f
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task, failed
 from imutool.report import UNSET, NamedProgress, silent
 
-COMPARED, TITLE = "fleet.json", b"<title>Fleet "
+COMPARED = "fleet.json"
 MAX_LISTED = 1000  # of the results with a problem, in JSON
 Wording = Callable[[str], str]
 
@@ -78,7 +79,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class FleetReport:
-    """Outcome of a fleet; `not_whole` holds the first 1000 results with a problem."""
+    """Outcome of a fleet: the first 1000 results with a problem are `not_whole`; `page_error` says why there is no page."""
 
     source: str
     out: Location
@@ -87,6 +88,7 @@ class FleetReport:
     seconds: float
     not_whole: tuple[Result, ...]
     comparison: Comparison | None
+    page_error: ConfigError | None = None
 
     def summary(self) -> FleetSummary:
         """Summary in JSON."""
@@ -130,13 +132,13 @@ def run(
 
     Raises:
         ConfigError: no logs, no engine, or an `out` that holds results or cannot be written; a page or `json_to` likewise.
-        KeyboardInterrupt: the message says how to go on; no partial file is left.
+        KeyboardInterrupt: its note says how to go on; no partial file is left.
     """
     began = time.perf_counter()
     results.arrow()  # before the work, not after
     target = _out(out)
     if not overwrite:
-        _refuse_existing(target, page if page is None or not (resume and _is_page(page)) else None)
+        _refuse_existing(target, None if page is None or (resume and pages.is_page(page)) else page)
     model = None if settings.model is None or not Path(settings.model).is_absolute() else _bytes(Path(settings.model))
     logs = find(source, target, bags=settings.command == "repair", once=settings.command == "diagnose")
     found = with_simulations(logs, settings.sim)
@@ -164,8 +166,8 @@ def run(
         except BaseException as error:  # workers have been killed
             with suppress(ConfigError):  # of a store that is gone: the first error is raised
                 fleet.remove_partial()
-            if isinstance(error, KeyboardInterrupt):
-                raise KeyboardInterrupt(f"{progress.line()}; go on with `resume`") from error
+            if isinstance(error, (KeyboardInterrupt, SystemExit)):
+                error.add_note(f"{progress.line()}; go on with `resume`")
             raise
         if isinstance(target, Path):  # of workers that died; in a store another run may be at work
             fleet.remove_partial()
@@ -181,15 +183,16 @@ def _report(
     comparison = compare(fleet.results(journal)) if settings.command == "diagnose" else None
     if comparison is not None:
         write_json(comparison.report(), out / COMPARED)
-    seconds = time.perf_counter() - began
+    seconds, page_error = time.perf_counter() - began, None
     if page is not None:
-        from imutool.fleet import page as pages
-
         every = (msgspec.structs.replace(result, error=wording(result.error)) for result in fleet.results(journal))
-        pages.write(every, settings, page, out=out, seconds=seconds, source=source, comparison=comparison, overwrite=True)
+        try:
+            pages.write(every, settings, page, out=out, seconds=seconds, source=source, comparison=comparison, overwrite=True)
+        except ConfigError as error:  # the logs are done: what came of them is told first
+            page_error = error.replaced(fix=f"{error.fix}, and go on with `resume`")
     not_whole = (result for result in fleet.results(journal) if (result.earlier or result.status) != "ok")
     first = tuple(result for result, _ in zip(not_whole, range(MAX_LISTED), strict=False))
-    return FleetReport(source, out, settings.command, progress, seconds, first, comparison)
+    return FleetReport(source, out, settings.command, progress, seconds, first, comparison, page_error)
 
 
 class _Fleet:
@@ -269,14 +272,6 @@ def _refuse_existing(out: Location, page: Location | None) -> None:
     for name in (results.NAME, COMPARED):
         if not exists(out / JOURNAL) and exists(out / name):
             raise ConfigError("the target exists", where=out / name, fix="Choose another `out`, or add `overwrite`")
-
-
-def _is_page(path: Location) -> bool:
-    """Whether a file is a page about a fleet."""
-    if not is_file(path):
-        return False
-    with path.open("rb") as file:
-        return TITLE in file.read(4096)
 
 
 def _bytes(path: Path) -> bytes:

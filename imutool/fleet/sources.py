@@ -33,13 +33,14 @@ from imutool.file_location import (
 from imutool.fleet.journal import NAME as JOURNAL
 from imutool.fleet.targets import relative, shown
 from imutool.fleet.task import Source
+from imutool.mcap_io.storage.output_conflicts import folded
 
 logger = logging.getLogger(__name__)
 
 LOG, BAG = ".mcap", ".bag"
 TABLES, ARCHIVES = (".csv", ".tsv", ".xlsx", ".parquet", ".npz", ".mat", ".h5", ".hdf5"), (".zip", ".tar", ".tgz", ".tar.gz")
 RAW = (BAG, ".db3", ".ulg", *TABLES, *ARCHIVES)
-CONVERT = "imutool convert makes logs of other recordings"
+CONVERT, HIDDEN = "imutool convert makes logs of other recordings", "hidden"
 PATTERN = re.compile(r"[*?\[]")
 
 
@@ -65,8 +66,9 @@ def find(text: str, out: Location, *, bags: bool = False, once: bool = False) ->
     these logs is left out.
 
     The name of a log is its path from the folder, or from the last part of a pattern before its first wildcard; a single log
-    keeps its own name. Links are followed, also to find what lies below `out`. A log without a usable name below OUT is
-    refused, as is a folder that cannot be read, and the others go on.
+    keeps its own name. Links are followed, also to find what lies below `out`. Hidden files are no logs, such as macOS's `._x.mcap`
+    and what lies in `.Trash`. A log without a usable name below OUT is refused, as is a folder that cannot be read, and the
+    others go on.
 
     Raises:
         ConfigError: nothing there, or no log in it.
@@ -83,6 +85,9 @@ def find(text: str, out: Location, *, bags: bool = False, once: bool = False) ->
         if real(file.rpartition("/")[0]).startswith(real(str(out))):
             outputs += _ends(where, endings)
             continue
+        if "/." in where[len(root.rstrip("/")) :]:
+            passed_over[HIDDEN] += 1
+            continue
         if not _ends(where, endings) and (ending := next((raw for raw in RAW if _ends(where, (raw,))), "")):
             passed_over[ending] += 1
             continue
@@ -90,29 +95,36 @@ def find(text: str, out: Location, *, bags: bool = False, once: bool = False) ->
             if unread:
                 raise ConfigError(f"cannot be read ({unread})", fix="See who may read it")
             name = relative(where, root)
-            before = taken.setdefault(name.casefold(), where)  # one file on some systems, two on others
+            before = taken.setdefault(folded(name), where)
             if before != where:
-                raise ConfigError(f"would be called {name}, and so would {before}", fix="Rename one of the two")
+                raise ConfigError(f"would be called {name} on some systems, and so would {before}", fix="Rename one of the two")
             place = to_location(where)
             if isinstance(place, Path) and exists(place) and not place.is_file():
                 raise ConfigError("is a pipe, a socket or a device", expected="a file", fix="Remove it")
             logs.append(Source(where, name, *(identity(place) if about is None else size_and_etag(about))))
         except ConfigError as error:
             refused.append((shown(where), str(error)))
-    if not logs and not refused and outputs:
-        what = f"its {outputs} logs lie below OUT ({redact(str(out))}), where outputs are and no sources"
-        raise ConfigError(what, where=text, fix="Choose an OUT outside the folder of the logs")
     if not logs and not refused:
-        expected = "a log, a folder with logs, or a pattern that fits some"
-        raise ConfigError(f"no {' or '.join(endings)} log", where=text, expected=expected, fix=CONVERT if passed_over else "")
+        raise _no_log(text, out, endings, outputs, passed_over)
     if outputs and not exists(out / JOURNAL):  # they are no results of a fleet
         redacted = redact(text), outputs, redact(str(out))
         logger.warning("%s: of its logs %d are left out, for they lie below OUT (%s); choose an OUT outside of it", *redacted)
     if passed_over:
         kinds = ", ".join(f"{count} {ending}" for ending, count in passed_over.items())
-        logger.warning("%s: files that are no MCAP logs are passed over (%s); %s", redact(text), kinds, CONVERT)
+        advice = f"; {CONVERT}" if {*passed_over} - {HIDDEN} else ""
+        logger.warning("%s: files that are no MCAP logs are passed over (%s)%s", redact(text), kinds, advice)
     logs.sort(key=lambda source: source.name)
     return Found(_without_links(logs, text) if once else logs, sorted(refused))
+
+
+def _no_log(text: str, out: Location, endings: tuple[str, ...], outputs: int, passed_over: Counter[str]) -> ConfigError:
+    """Error of a source without a log: what is there instead."""
+    if outputs:
+        what = f"its {outputs} logs lie below OUT ({redact(str(out))}), where outputs are and no sources"
+        return ConfigError(what, where=text, fix="Choose an OUT outside the folder of the logs")
+    fix = CONVERT if {*passed_over} - {HIDDEN} else f"Rename its {passed_over[HIDDEN]} hidden files" if passed_over else ""
+    expected = "a log, a folder with logs, or a pattern that fits some"
+    return ConfigError(f"no {' or '.join(endings)} log", where=text, expected=expected, fix=fix)
 
 
 def _without_links(logs: list[Source], text: str) -> list[Source]:
@@ -227,7 +239,7 @@ def _walk(folder: Location, endings: tuple[str, ...], above: frozenset[object]) 
         return
     yield from unread
     for name in folders:
-        yield from _walk(folder / name, endings, above | {inode})
+        yield from _walk(folder / name, endings, above | {inode}) if name[0] != "." else ()
     yield from (_File(str(folder / name)) for name in files if _ends(name, endings))
 
 

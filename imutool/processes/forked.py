@@ -27,7 +27,7 @@ from imutool.processes.system import can_fork, fork, kill, processors
 
 T = TypeVar("T")
 R = TypeVar("R")
-SIGNALS = signal.SIGINT, signal.SIGTERM
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 WORTH_S = 0.2  # half of it goes for a fork and for memory that is copied when one of two writes to it
 IDLE = 10  # by how much an idle process is nicer than this one
 

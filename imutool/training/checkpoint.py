@@ -64,11 +64,9 @@ class Descent:
                 self.say(epoch)
                 if checkpointed and epoch.step:
                     save(training, self.kept)
-        except KeyboardInterrupt as interrupt:  # it may have struck in the middle of a step: what is kept is from before
+        except (KeyboardInterrupt, SystemExit) as end:  # perhaps in the middle of a step: what is kept is from before
             if self.kept.exists():
-                raise KeyboardInterrupt(
-                    f"{self.kept} holds what is done; the same command with `resume` goes on from there"
-                ) from interrupt
+                end.add_note(f"{self.kept} holds what is done; the same command with `resume` goes on from there")
             raise
         return training
 

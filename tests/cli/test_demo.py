@@ -114,7 +114,9 @@ def test_raw_files_of_a_flight_convert_back_to_the_same_bits(tmp_path: Path) -> 
 
 def test_an_interrupted_training_advises_no_option_of_another_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def interrupted(*args: Any, **options: Any) -> None:
-        raise KeyboardInterrupt("the same command with `resume` goes on from there")
+        end = KeyboardInterrupt()
+        end.add_note("the same command with `resume` goes on from there")
+        raise end
 
     monkeypatch.setattr("imutool.training.run.train", interrupted)
     monkeypatch.setattr("imutool.conversion.run.convert", lambda *args, **options: None)

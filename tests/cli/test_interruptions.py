@@ -40,7 +40,7 @@ from imutool.viewing.html import report
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
-CONFIG, LOST, INTERRUPTED, TERMINATED, KILLED = 3, 3, 130, 143, -signal.SIGKILL
+CONFIG, LOST, HUNG_UP, INTERRUPTED, TERMINATED, KILLED = 3, 3, 129, 130, 143, -signal.SIGKILL
 WAIT_S, POLL_S, TRIES = 60.0, 0.002, 10
 STILL_S = 0.05  # every process of a session has stood still by then
 SOON_S, SLACK_S = 2.0, 3.0  # after SIGTERM, for a process and all its children; for a machine busy with other tests
@@ -198,7 +198,8 @@ AT_WORK: dict[str, Sequence[str]] = {
     "audit": ["audit", "in.mcap", "--json", "out.json"],
     "view --web": ["view", "in.mcap", "--web"],
 }  # fleets: tests/fleet/test_fleet.py
-CODES = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: TERMINATED, signal.SIGKILL: KILLED}
+CODES = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: TERMINATED, signal.SIGHUP: HUNG_UP, signal.SIGKILL: KILLED}
+HOW = {signal.SIGINT: "interrupted", signal.SIGTERM: "ended by SIGTERM", signal.SIGHUP: "ended by SIGHUP"}
 
 
 def read_for_ever() -> None:
@@ -212,7 +213,7 @@ def read_for_ever() -> None:
 
 @pytest.mark.parametrize("name", AT_WORK)
 def test_a_signal_while_the_input_is_read(here: Path, name: str) -> None:
-    """Three runs at once, each with a signal of its own: the exit code is the signal's, and nothing is left."""
+    """Runs at once, each with a signal of its own: the exit code is the signal's, a sentence says it, and nothing is left."""
     for number in CODES:
         (here / number.name).mkdir()
         shutil.copy(here / "in.mcap", here / number.name)
@@ -225,10 +226,24 @@ def test_a_signal_while_the_input_is_read(here: Path, name: str) -> None:
         _, stderr = run.communicate(timeout=WAIT_S)
         assert time.monotonic() - began < SOON_S + SLACK_S
         assert run.returncode == CODES[number], stderr
-        assert "Traceback" not in stderr
+        assert stderr == (f"error: {HOW[number]}. Nothing half-written is left.\n" if number in HOW else "")
         soon(lambda pid=run.pid: not session(pid))  # the system ends the copies of one that is killed a moment later
         (here / number.name / "reading").unlink(missing_ok=True)
     assert {path: digest for path, digest in digests(here).items() if ".partial" not in path} == before
+
+
+def as_under_nohup() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    read_for_ever()
+
+
+def test_a_closed_terminal_does_not_end_what_nohup_began(here: Path) -> None:
+    run = Forked(["info", "in.mcap"], here, as_under_nohup)
+    soon((here / "reading").exists)
+    run.send_signal(signal.SIGHUP)
+    run.send_signal(signal.SIGTERM)
+    run.communicate(timeout=WAIT_S)
+    assert run.returncode == TERMINATED
 
 
 IMPORTED_FIRST = ("imutool.cli.parameters", "typer.core", "rich.console", "imutool.cli.app", "imutool.report")

@@ -367,7 +367,12 @@ def test_a_killed_worker_takes_its_log_alone(
     assert digests(out) == expected
 
 
-ENDS = {"driver": signal.SIGKILL, "terminated": signal.SIGTERM, "Ctrl-C": signal.SIGINT}
+ENDS = {
+    "driver": (signal.SIGKILL, -signal.SIGKILL, ""),
+    "terminated": (signal.SIGTERM, 143, "ended by SIGTERM"),
+    "terminal closed": (signal.SIGHUP, 129, "ended by SIGHUP"),
+    "Ctrl-C": (signal.SIGINT, 130, "interrupted"),
+}
 LEFT_S = 2.0
 
 
@@ -388,13 +393,13 @@ def test_a_fleet_that_is_ended_goes_on_where_it_was(
     soon(lambda: len(list(out.glob("*.mcap"))) >= 2)
     family, began = below(running.pid), time.monotonic()
     assert len(family) == 2
-    running.send_signal(ENDS[end])
+    number, code, how = ENDS[end]
+    running.send_signal(number)
     soon(lambda: not any(lives(pid) for pid in family[1:]))
     assert time.monotonic() - began < LEFT_S
     _, said = running.communicate(timeout=SOON_S)
-    assert running.returncode == {"driver": -signal.SIGKILL, "terminated": 143, "Ctrl-C": 130}[end], said
-    if end == "Ctrl-C":
-        assert re.search(r"interrupted\. \d of 6 done.*go on with --resume", said)
+    assert running.returncode == code, said
+    assert re.search(rf"error: {how}\. \d of 6 done.*go on with --resume\.\n$" if how else "^$", said)
     if end != "driver":
         assert not list(out.glob(".*.partial"))
     done = len(list(out.glob("*.mcap")))
@@ -423,6 +428,18 @@ def test_the_command_says_what_came_of_it(fleet: Path, tmp_path: Path) -> None:
     report = json.loads(done.stdout)
     assert (report["schema"], report["statuses"]) == ("imutool.fleet/1", {"failed": 1, "skipped": 2})
     assert report["not_whole"][0]["source"] == str(fleet / "bad.mcap")
+
+
+def test_a_page_that_cannot_be_written_hides_nothing_that_was_done(fleet: Path, tmp_path: Path) -> None:
+    (fleet / "bad.mcap").write_bytes(b"no log")
+    words = ["fleet", "info", str(fleet), str(tmp_path / "out"), "--report", "/proc/page.html"]  # not even root makes a file there
+    done = CliRunner().invoke(load(), [*words, "--json", str(tmp_path / "fleet.json")])
+    assert done.exit_code == 3
+    assert f"{fleet / 'bad.mcap'}: " in done.stdout
+    assert "2 of 3 done, 1 failed" in done.stdout
+    assert "page.html" not in done.stdout
+    assert re.search(r"/proc/page.html: cannot be written .*, and go on with --resume", done.stderr)
+    assert json.loads((tmp_path / "fleet.json").read_text())["logs"] == 3
 
 
 def test_a_path_that_is_no_utf_8_is_told(fleet: Path, tmp_path: Path) -> None:

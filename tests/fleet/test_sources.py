@@ -173,7 +173,6 @@ def test_no_logs_is_an_error_that_says_so(tmp_path: Path, empty: str) -> None:
 HOSTILE = [
     "bell\a.mcap",
     "line\nbreak.mcap",
-    ".hidden.mcap",
     "fleet.mcap",
     "back\\slash.mcap",
     f"{'x' * LONGEST}.mcap",
@@ -192,8 +191,21 @@ def test_a_hostile_name_is_refused_and_the_others_go_on(tmp_path: Path, name: st
     assert "name" in why
 
 
-def test_names_that_differ_in_case_alone_are_one_on_some_systems(tmp_path: Path) -> None:
-    tree(tmp_path, "Log.mcap", "log.mcap")
+def test_hidden_files_are_no_logs(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """macOS writes a ._NAME next to each file on foreign disks; its trash is a folder that nobody may list."""
+    hidden = ("._log.mcap", "a/._log.mcap", "a/__MACOSX/a/._log.mcap", "._t.csv", ".Trashes/501/old.mcap")
+    tree(tmp_path, "log.mcap", "a/log.mcap", *hidden)
+    found = find(str(tmp_path), NOWHERE)
+    assert ([log.name for log in found.logs], found.refused) == (["a/log.mcap", "log.mcap"], [])
+    assert caplog.messages == [f"{tmp_path}: files that are no MCAP logs are passed over (4 hidden)"]
+    assert names(tmp_path / "**") == ["a/log.mcap", "log.mcap"]
+    with pytest.raises(ConfigError, match=r"no \.mcap log.*Rename its 1 hidden files"):
+        find(str(tmp_path / "._log.mcap"), NOWHERE)
+
+
+@pytest.mark.parametrize("twins", [("Log.mcap", "log.mcap"), ("k\u00fche.mcap", "ku\u0308he.mcap")])
+def test_names_that_differ_in_case_or_unicode_form_alone_are_one_on_some_systems(tmp_path: Path, twins: tuple[str, str]) -> None:
+    tree(tmp_path, *twins)
     found = find(str(tmp_path), NOWHERE)
     assert len(found.logs) == 1
     ((_, why),) = found.refused

@@ -209,11 +209,12 @@ def _same(a: Path, b: Path) -> bool:
     first, second = Path(os.path.realpath(a)), Path(os.path.realpath(b))
     if first == second:
         return True
-    alike = _folded(first.name) == _folded(second.name)
+    alike = folded(first.name) == folded(second.name)
     return alike and _same(first.parent, second.parent) and ignores_case(first.parent)
 
 
-def _folded(name: str) -> str:
+def folded(name: str) -> str:
+    """Key that names share which are one file on some systems: they differ in case or Unicode form alone."""
     return unicodedata.normalize("NFC", name).casefold()
 
 

@@ -92,7 +92,8 @@ def spectrum(data: RunData) -> Picture | None:
         for sensor in SENSORS
         if curves[sensor]
     ]
-    caption = "Amplitude density of the samples (Welch), up to half their rate."
+    caption = "Amplitude density of the samples (Welch, one-sided), up to half their rate."
+    caption += " White noise lies √2 above the noise density of imutool info --noise, which is two-sided."
     caption += " Dashed: the difference, raw minus debiased; it is small where the curves coincide." * bool(subtracted)
     return Picture("spectrum", "Spectra", caption, tuple(panels))
 
@@ -244,7 +245,7 @@ def _draw_spectrum(
     curves: Sequence[Any],
     subtracted: Sequence[tuple[Trace, Mapping[str, Spectrum]]],
 ) -> None:
-    panels = _by_axis(figure, f"{NOUNS[sensor]} ({UNITS[sensor]}/√Hz)", "")
+    panels = _by_axis(figure, f"{NOUNS[sensor]} ({UNITS[sensor]}/√Hz, one-sided)", "")
     lines = []
     for trace, frequency_hz, density in curves:
         at, power = average_log_bins(frequency_hz, density, frequency_hz[0])

@@ -19,8 +19,8 @@ from imutool.viewing.rerun.sdk import Scope
 TITLES = {sensor: f"{NOUNS[sensor]} ({UNITS[sensor]})" for sensor in SENSORS}
 BIAS_TITLES = {"gyro": "Gyro bias (rad/s)", "accel": "Accel bias (m/s²)"}
 SPECTRUM_TITLES = {
-    "gyro": "Angular rate: root of density (rad/s/√Hz) over frequency",
-    "accel": "Specific force: root of density (m/s²/√Hz) over frequency",
+    "gyro": "Angular rate: root of one-sided density (rad/s/√Hz) over frequency",
+    "accel": "Specific force: root of one-sided density (m/s²/√Hz) over frequency",
 }
 SIGMA_PERCENTILE = 90.0  # share of the log for which three standard deviations fit into a plot of biases, %
 MARGIN = 0.15  # of its range, free above and below the curves of a plot
