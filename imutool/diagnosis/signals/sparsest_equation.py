@@ -43,7 +43,7 @@ SCALED: Mapping[str, tuple[Form, str]] = {
 
 
 def channels(samples: SignalSamples, k: int) -> dict[str, Samples]:
-    """Channels of a term by name: the motion of all joints, or the ideal value, its rate, the state and others."""
+    """Channels of a term by name: the joints' motion, or the ideal value, its rate and others."""
     if "q0" in samples.state:
         return {name: values for name, values in samples.state.items() if name.rstrip("0123456789") in WORDS}
     states = {name: values for name, values in samples.state.items() if not name.startswith(("R", "v"))}
@@ -53,7 +53,10 @@ def channels(samples: SignalSamples, k: int) -> dict[str, Samples]:
 
 @dataclass(frozen=True)
 class Term:
-    """Forward model of c times a form of one or two channels, in one column; `code` is the form as Python of `words`."""
+    """Forward model of c times a form of one or two channels, in one column.
+
+    `code` is the form in Python, with the `words` of its channels.
+    """
 
     column: int
     names: tuple[str, ...]
@@ -103,8 +106,8 @@ def _of_one(signal: AlignedSignal, k: int, name: str, by_name: Mapping[str, Samp
     for text, form in SCALED.items():
         yield _effect(signal, k, (name,), text, form, by_name, scale=float(values.std()))
     for n, (word, wave) in product(MULTIPLES if is_angle else (), (("sin", np.sin), ("cos", np.cos))):
-        form: tuple[Form, str] = partial(_of_multiple, wave, n), f"np.{word}({n} * {{0}})"
-        yield _effect(signal, k, (name,), f"{word}({{v}})" if n == 1 else f"{word}({n} {{v}})", form, by_name)
+        multiple = partial(_of_multiple, wave, n), f"np.{word}({n} * {{0}})"
+        yield _effect(signal, k, (name,), f"{word}({{v}})" if n == 1 else f"{word}({n} {{v}})", multiple, by_name)
 
 
 def _of_multiple(wave: Form, n: int, v: Samples) -> Any:
