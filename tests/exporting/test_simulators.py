@@ -76,6 +76,8 @@ def test_mujoco_loads_the_site_the_sensors_and_the_ranges(tmp_path: Path) -> Non
     np.testing.assert_allclose(scale, (0.02, 0.018, 0.022))
     np.testing.assert_allclose(model.numeric("imu.gyro_noise.y").data, 2e-3 * np.sqrt(RATE_HZ) * np.array([1.0, 0.5, 1.5]))
     assert report.left_out == ["quantization", "gyro_scale", "the colour of the noise"]
+    assert (report.output, report.format, report.imu) == (tmp_path / "out", "mujoco", None)
+    assert set(report.written) == {"imu.xml", "physics.toml", "noise.toml"}
 
 
 def test_mujocos_own_sensor_reads_what_the_forward_model_says(tmp_path: Path) -> None:
@@ -103,6 +105,7 @@ def test_gazebo_has_pose_noise_walk_and_digits_by_axis(tmp_path: Path) -> None:
     assert read["precision"] == 0.001
     assert read["dynamic_bias_stddev"] == 1e-5
     np.testing.assert_allclose(read["stddev"], 3e-3 * np.sqrt(RATE_HZ), rtol=1e-6)
+    assert sensor.findtext("imu/linear_acceleration/x/noise/dynamic_bias_stddev") == "0", "an unknown walk is none"
 
 
 def test_a_given_noise_has_the_rate_of_the_diagnosed_sensor(tmp_path: Path) -> None:
@@ -162,7 +165,7 @@ def test_isaac_is_python_with_the_classes_of_isaac_lab(tmp_path: Path, monkeypat
 def test_a_fleet_gives_means_and_ranges(tmp_path: Path) -> None:
     for k, x in enumerate((0.04, 0.05, 0.06)):
         diagnosed(tmp_path / "fleet" / f"robot_{k}", arm_x=x, bias_x=0.01 * k)
-    export(tmp_path / "fleet", tmp_path / "out", format="toml")
+    assert export(tmp_path / "fleet", tmp_path / "out", format="toml").left_out == []
     file = physics_file.read(tmp_path / "out" / "physics.toml")
     arm = next(entry for entry in file.effect if entry.name == "lever_arm").parameters["x"]
     assert arm.value == pytest.approx(0.05)
@@ -183,6 +186,7 @@ def test_a_scale_that_sets_in_is_none_of_the_whole_simulation(tmp_path: Path) ->
     datasheet.write(NOISE, tmp_path / "noise.toml")
     twin = read(tmp_path)
     assert not twin.vector("gyro_scale").any()
+    assert twin.ranges()["gyro_scale.x"][:3] == (0.02, 0.02, 0.02)
     assert export(tmp_path, tmp_path / "out", format="mujoco").left_out[0] == "gyro_scale"
 
 
@@ -197,6 +201,7 @@ def test_two_lines_of_a_vibration_stay_two(tmp_path: Path) -> None:
     report = export(tmp_path / "fleet", tmp_path / "out", format="mujoco")
     found = physics_file.read(tmp_path / "out" / "physics.toml").effect
     assert [entry.parameters["f"].value for entry in found] == [31.0, 91.0]
+    assert [entry.parameters["f"].std for entry in found] == [pytest.approx(np.sqrt(2.0))] * 2
     assert report.left_out[-2:] == ["gyro_bias_step of 2 of 2 units", "gyro_scale of 1 of 2 units"]
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "imu.xml"))
     assert [model.numeric(f"imu.vibration_accel{n}.f").data[0] for n in ("", "_2")] == [31.0, 91.0]
