@@ -20,7 +20,7 @@ from imutool.exporting.twin import read
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Colour, Noise
 from imutool.sensor import physics_file
-from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
+from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
 
 PHI, ARM, RATE_HZ = (0.1, -0.2, 0.3), (0.05, -0.02, 0.01), 250.0
 NOISE = Noise(
@@ -182,12 +182,16 @@ def _lines(*f_hz: float) -> tuple[Entry, ...]:
 def test_a_scale_that_sets_in_is_none_of_the_whole_simulation(tmp_path: Path) -> None:
     values = {"x": Value(value=0.02, unit="-"), "t_step": Value(value=20.0, unit="s")}
     later = Entry(name="gyro_scale", signal="gyro", parameters=values)
-    physics_file.write(PhysicsFile(effect=(later,)), tmp_path / "physics.toml")
+    term = Term(signal="accel", term="omega_x omega_y", value=(0.2, 0.0, -0.1))
+    curve = Curve(signal="gyro", variable="f_x", unit="m/s²", x=(-3.0, 0.0, 3.0), y=((0.06, 0.0, 0.0),) * 3)
+    physics_file.write(PhysicsFile(effect=(later,), term=(term,), unknown=(curve,)), tmp_path / "physics.toml")
     datasheet.write(NOISE, tmp_path / "noise.toml")
     twin = read(tmp_path)
     assert not twin.vector("gyro_scale").any()
     assert twin.ranges()["gyro_scale.x"][:3] == (0.02, 0.02, 0.02)
-    assert export(tmp_path, tmp_path / "out", format="mujoco").left_out[0] == "gyro_scale"
+    assert twin.ranges()["gyro_bias.x"][:3] == (0.0, 0.0, 0.0), "nothing is known of it"
+    left_out = export(tmp_path, tmp_path / "out", format="mujoco").left_out
+    assert left_out == ["gyro_scale", "a curve of f_x", "omega_x omega_y", "the colour of the noise"]
 
 
 def test_two_lines_of_a_vibration_stay_two(tmp_path: Path) -> None:
@@ -205,6 +209,18 @@ def test_two_lines_of_a_vibration_stay_two(tmp_path: Path) -> None:
     assert report.left_out[-2:] == ["gyro_bias_step of 2 of 2 units", "gyro_scale of 1 of 2 units"]
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "imu.xml"))
     assert [model.numeric(f"imu.vibration_accel{n}.f").data[0] for n in ("", "_2")] == [31.0, 91.0]
+
+
+def test_lines_of_two_sensors_are_two_effects(tmp_path: Path) -> None:
+    """Whichever is the faster in a unit."""
+    for name, of_gyro, of_accel in (("a", 90.0, 30.0), ("b", 34.0, 94.0)):
+        (line,) = _lines(of_accel)
+        (tmp_path / "fleet" / name).mkdir(parents=True)
+        other = msgspec.structs.replace(line, signal="gyro", parameters={"f": Value(value=of_gyro, unit="Hz")})
+        physics_file.write(PhysicsFile(effect=(line, other)), tmp_path / "fleet" / name / "physics.toml")
+        datasheet.write(NOISE, tmp_path / "fleet" / name / "noise.toml")
+    found = read(tmp_path / "fleet").physics.effect
+    assert {entry.signal: entry.parameters["f"].value for entry in found} == {"accel": 62.0, "gyro": 62.0}
 
 
 def test_what_is_no_diagnosis_is_refused(tmp_path: Path) -> None:
