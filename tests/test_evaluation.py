@@ -29,7 +29,7 @@ from imutool.bias_start.prior_width import BiasPrior
 from imutool.cli import load
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, DataError, LogError, ModelError
-from imutool.evaluation import evaluate, runs
+from imutool.evaluation import evaluate, runs, started
 from imutool.geometry import quaternion
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids
@@ -112,6 +112,24 @@ def test_the_drift_is_as_large_as_the_covariance_of_the_bias_lets_expect(init: s
         shares.append([found[f"drift_{name}"] / found[f"drift_{std}"] for name, std in DRIFTS])
     assert (np.sqrt(np.mean(np.square(shares), axis=0)) < 2.0).all()
     assert (np.median(shares, axis=0) > 0.1).all()
+
+
+def test_the_drift_of_a_constant_error_is_that_error_times_the_window(tmp_path: Path) -> None:
+    """Of a body at rest; what is expected of it is the deviation of the bias times the window."""
+    t_ns = 5_000_000 * np.arange(4001)
+    imu = Imu(t_ns, np.tile([0.0, 0.0, 0.01], (4001, 1)), np.tile([0.0, 0.0, 9.91], (4001, 1)))
+    still = Poses(t_ns[::2], np.zeros((2001, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (2001, 1)))
+    recording = Recording("still", imu, {"/t": still})
+    write(recording, tmp_path / "still.mcap")
+    raw, given = evaluate(tmp_path / "still.mcap", models=["static"], init="0,0,0.004,0,0,0.04")
+    for result, gyro, accel in ((raw, 0.01, 0.1), (given, 0.006, 0.06)):
+        assert result["drift_orientation_deg"] == pytest.approx(np.degrees(5.0 * gyro), rel=1e-6)
+        assert result["drift_velocity_m_s"] == pytest.approx(5.0 * accel, rel=1e-6)
+    _, measured = evaluate(tmp_path / "still.mcap", models=["static"])
+    ((_, _, start),) = started(recording, ["static"], "auto", "still")
+    gyro, accel = 5.0 * np.linalg.norm(start.std.reshape(2, 3), axis=1)  # the bias walks, too, which shows in the gyro's alone
+    assert measured["drift_velocity_std_m_s"] == pytest.approx(accel, rel=1e-3)
+    assert measured["drift_orientation_std_deg"] == pytest.approx(np.degrees(gyro), rel=0.7)
 
 
 @pytest.mark.parametrize("late_s", [0.006, -0.004])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imutool.recording.gyro_steps import STEPS, _counts_in, _likely, unit_by_steps
+from imutool.recording.gyro_steps import MAX_OFF, STEPS, _counts_in, _likely, unit_by_steps
 
 
 @pytest.mark.parametrize(("unit", "step"), STEPS)
@@ -30,3 +30,20 @@ def test_noise_has_no_steps() -> None:
     rates = np.random.default_rng(1).normal(size=(4000, 3))
     assert unit_by_steps(rates) is None
     assert sum(_likely([np.sort(axis) for axis in rates.T], np.array([step for _, step in STEPS]))) < len(STEPS) / 2
+
+
+@pytest.mark.parametrize(("step", "unit"), [(2000.0 / 2**15, "deg/s"), (np.deg2rad(1.0 / 16.4), "rad/s")])
+def test_a_fast_motion_counts_in_whole_steps_though_few_values_are_near_its_median(step: float, unit: str) -> None:
+    counts = np.random.default_rng(2).normal(scale=8000.0, size=(500, 3)).round()
+    assert unit_by_steps(step * counts) == (unit, pytest.approx(step))
+    assert unit_by_steps(step * (counts + 0.3)) is None, "between the steps"
+    assert unit_by_steps(step * 7.0 * counts) is None, "a multiple of them"
+    assert unit_by_steps(step * counts[:50]) is None, "few values"
+    assert unit_by_steps(step * 50.0 * counts) is None, "more than a register holds"
+
+
+def test_a_calm_motion_counts_in_steps_about_an_offset() -> None:
+    """As of a bias that was taken off: its values are no whole steps."""
+    step = np.deg2rad(1.0 / 16.4)
+    counts = np.random.default_rng(3).normal(scale=20.0, size=(2000, 3)).round() + np.array([0.0, 0.3, -0.4])
+    assert unit_by_steps(step * counts) == ("rad/s", pytest.approx(step, rel=MAX_OFF))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from imutool.errors import DataError
 from imutool.recording.joined_imu import joined, sensor_delay, unit_by_gravity
 from imutool.recording.sample_order import in_order
 
@@ -42,6 +45,34 @@ def test_a_planted_delay_is_found(delay_s):
     assert found is not None
     assert abs(found.seconds - delay_s) < WITHIN_S
     assert found.std_s < WITHIN_S
+
+
+@pytest.mark.parametrize(("delay_s", "side"), [(0.012, "later"), (-0.012, "earlier")])
+def test_a_delay_is_said_with_its_side(delay_s, side):
+    gyro_ns, gyro, accel_ns, accel = measured(delay_s)
+    note, *_ = joined(gyro_ns, gyro, accel_ns, accel, "/imu0").notes
+    assert "gyro at 400.0 Hz and accelerometer at 250.0 Hz" in note
+    (size_ms,) = re.findall(rf"the accelerometer's stamps are ([\d.]+) ms {side} than the gyro's", note)
+    assert float(size_ms) == pytest.approx(12.0, abs=1e3 * WITHIN_S)
+
+
+def test_the_accelerometer_is_interpolated_but_not_over_a_gap():
+    gyro_ns, gyro, accel_ns, accel = measured(0.0)
+    kept = (accel_ns < accel_ns[5000]) | (accel_ns > accel_ns[5050])  # 0.2 s are missing
+    imu, rows, notes = joined(gyro_ns, gyro, accel_ns[kept], accel[kept], "/imu0")
+    inside = (gyro_ns <= accel_ns[4999]) | (gyro_ns > accel_ns[5051])
+    assert np.array_equal(rows, np.flatnonzero(inside & (gyro_ns <= accel_ns[-1])))
+    assert np.array_equal(imu.gyro, gyro[rows])
+    expected = [np.interp(imu.t_ns - accel_ns[0], accel_ns - accel_ns[0], column) for column in accel.T]
+    np.testing.assert_allclose(imu.accel, np.stack(expected, axis=1), rtol=0, atol=1e-9)
+    assert notes[-1] == f"/imu0: gyro samples without an accelerometer sample near them: {len(gyro) - len(rows)}"
+
+
+@pytest.mark.parametrize("later_s", [-2.0 * DURATION_S, 2.0 * DURATION_S])
+def test_sensors_of_two_times_are_no_imu(later_s):
+    gyro_ns, gyro, accel_ns, accel = measured(0.0)
+    with pytest.raises(DataError, match="gyro and accelerometer share no time"):
+        joined(gyro_ns, gyro, accel_ns + round(1e9 * later_s), accel, "/imu0")
 
 
 def test_a_slow_motion_that_repeats_is_not_certain_of_a_delay():

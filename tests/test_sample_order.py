@@ -60,6 +60,13 @@ def test_samples_of_one_stamp_are_all_kept_near_the_truth(t, stamps, kept_before
     assert np.array_equal(found.t_ns[alone], stamps[alone])
 
 
+def test_a_first_stamp_that_had_begun_before_the_recording_ends_at_the_next_one():
+    """Two of a batch of five: they are its last two, and not two that a step of the others apart."""
+    stamps = arrived(np.repeat(T_200[::5], 5), 0.0)[3:]
+    found = in_order(stamps, motion(T_200[3:]), "imu")
+    assert errors_ms(found.t_ns, T_200[3:])[0] < 1e-3
+
+
 def test_late_samples_move_back_and_those_of_a_rounded_stamp_ahead():
     t = T_400[:4000]
     assert "earlier than recorded" in in_order(arrived(t, 2e-3), motion(t), "imu").notes[0]

@@ -55,6 +55,7 @@ class AidSettings(Settings, frozen=True, kw_only=True):
     mount_rad: Positive = 0.03  # least error of a mount that the log shows
     levelled_rad: Positive = 0.1  # of an IMU whose x is taken for forward
     scale: Positive = 0.03
+    offset_m: Positive = 100.0  # of a height at the start of the path, which begins anywhere in a log
     height_m: Positive = 0.1  # without the barometer's own white noise
     height_walk_m: Positive = 0.05  # per second^1/2
     height_window_s: Positive = 0.5
@@ -125,7 +126,7 @@ class _Measurements:
             noise = CALM * float(white_noise(given.values)[0])
             self._height = mean[:, 0]
             self._height_std = np.where(count > 0, np.sqrt(s.height_m**2 + noise**2 / np.maximum(count, 1)), np.inf)
-        self.std = np.concatenate([[1.0], np.full(3, s.lever_m), np.full(3, mount_rad), [s.scale]])
+        self.std = np.concatenate([[s.offset_m], np.full(3, s.lever_m), np.full(3, mount_rad), [s.scale]])
 
     def __call__(self, x: State, t_s: float) -> State:
         row = min(int(np.searchsorted(self._t_s, t_s)), len(self._t_s) - 1)

@@ -47,8 +47,9 @@ def parse_aids(words: str) -> dict[str, str]:
     asked = dict[str, str]()
     for word in words.split(","):
         kind, _, topic = word.strip().partition("=")
-        if kind not in (*KINDS, AUTO) or (topic and kind not in (BAROMETER, WHEELS)):
-            fix = did_you_mean(kind, KINDS) or "Only barometer and odometry take a topic"
+        is_known = kind in (*KINDS, AUTO)
+        if not is_known or (topic and kind not in (BAROMETER, WHEELS)):
+            fix = f"Only {BAROMETER} and {WHEELS} take a topic" if is_known else did_you_mean(kind, KINDS)
             raise ConfigError(f"aid {word!r}", where="aid", expected=f"auto, or some of {', '.join(KINDS)}", fix=fix)
         asked[kind] = topic
     return asked

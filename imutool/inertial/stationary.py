@@ -202,7 +202,7 @@ class OnlineRestDetector:
             return False
         if noise[0] > s.gyro_noise_rad_s or noise[1] > s.accel_noise_m_s2 or not _may_be_bias(centre, whole[3:], s):
             return False
-        floor = self._calmest[min(FLOOR_RANK, self._windows // 10, len(self._calmest) - 1)]
+        floor = self._calmest[min(FLOOR_RANK, self._windows // 10)]
         white = float(_white_margin(var[:, :3].sum(axis=0))) * noise[0] / math.sqrt(k)
         half = len(mean) // 2
         trend = float(np.linalg.norm(mean[-half:, :3].sum(axis=0) - mean[:half, :3].sum(axis=0))) / half

@@ -16,6 +16,7 @@ from imutool.bias_start.correction import OnlineDebiaser, apply
 from imutool.bias_start.initial_bias import prior
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, ModelError
+from imutool.evaluation import evaluate
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording, seconds
@@ -210,3 +211,6 @@ def test_a_log_is_debiased_by_the_physics_that_made_it(trajectory: Path, ideal: 
             np.sqrt(np.mean((getattr(one.imu, sensor) - getattr(ideal.imu, sensor)) ** 2)) for one in (noisy, clean)
         )
         assert after < share * before
+    before, after = evaluate(raw, models=[file])  # a physics.toml is for the rate of the log
+    assert (after["model"], after["fit"]["verdict"]) == ("physics", "fits")
+    assert after["aoe_deg"] < 0.1 * before["aoe_deg"]

@@ -154,6 +154,22 @@ def test_a_barometer_holds_the_height_though_its_offset_drifts() -> None:
     assert up < 0.3
 
 
+@pytest.mark.parametrize("from_s", [0.0, 8.0])
+def test_heights_may_count_from_anywhere(from_s: float) -> None:
+    """Of a log whose truth begins 30 m above its first height, the vertical error was three times as large."""
+    imu, true = there_and_back()
+    t_ns, z = imu.t_ns[::10], true.p_wb[::10, 2] + 0.1 * np.random.default_rng(3).normal(size=len(imu.t_ns[::10]))
+    heard = 1e-9 * (t_ns - t_ns[0]) >= from_s
+    paths = [
+        aided_path(
+            imu, StartPose.of(true), KNOWN, Aids({"barometer": ""}, height=Scalars(t_ns[heard], (z + off)[heard][:, None], "m"))
+        )
+        for off in (-true.p_wb[0, 2], 30.0)
+    ]
+    np.testing.assert_allclose(paths[1].p_wb[:, 2], paths[0].p_wb[:, 2], rtol=0, atol=1e-3)
+    assert rms((paths[1].p_wb - true.p_wb)[:, 2]) < 0.3
+
+
 def test_a_barometer_has_the_whole_white_noise_of_its_values(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a mean over half a second; it had five sixths of the noise."""
     imu, true = there_and_back()

@@ -20,7 +20,7 @@ from imutool.exporting.twin import read
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Colour, Noise
 from imutool.sensor import physics_file
-from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
+from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
 
 PHI, ARM, RATE_HZ = (0.1, -0.2, 0.3), (0.05, -0.02, 0.01), 250.0
 NOISE = Noise(
@@ -76,6 +76,8 @@ def test_mujoco_loads_the_site_the_sensors_and_the_ranges(tmp_path: Path) -> Non
     np.testing.assert_allclose(scale, (0.02, 0.018, 0.022))
     np.testing.assert_allclose(model.numeric("imu.gyro_noise.y").data, 2e-3 * np.sqrt(RATE_HZ) * np.array([1.0, 0.5, 1.5]))
     assert report.left_out == ["quantization", "gyro_scale", "the colour of the noise"]
+    assert (report.output, report.format, report.imu) == (tmp_path / "out", "mujoco", None)
+    assert set(report.written) == {"imu.xml", "physics.toml", "noise.toml"}
 
 
 def test_mujocos_own_sensor_reads_what_the_forward_model_says(tmp_path: Path) -> None:
@@ -103,6 +105,7 @@ def test_gazebo_has_pose_noise_walk_and_digits_by_axis(tmp_path: Path) -> None:
     assert read["precision"] == 0.001
     assert read["dynamic_bias_stddev"] == 1e-5
     np.testing.assert_allclose(read["stddev"], 3e-3 * np.sqrt(RATE_HZ), rtol=1e-6)
+    assert sensor.findtext("imu/linear_acceleration/x/noise/dynamic_bias_stddev") == "0", "an unknown walk is none"
 
 
 def test_a_given_noise_has_the_rate_of_the_diagnosed_sensor(tmp_path: Path) -> None:
@@ -162,7 +165,7 @@ def test_isaac_is_python_with_the_classes_of_isaac_lab(tmp_path: Path, monkeypat
 def test_a_fleet_gives_means_and_ranges(tmp_path: Path) -> None:
     for k, x in enumerate((0.04, 0.05, 0.06)):
         diagnosed(tmp_path / "fleet" / f"robot_{k}", arm_x=x, bias_x=0.01 * k)
-    export(tmp_path / "fleet", tmp_path / "out", format="toml")
+    assert export(tmp_path / "fleet", tmp_path / "out", format="toml").left_out == []
     file = physics_file.read(tmp_path / "out" / "physics.toml")
     arm = next(entry for entry in file.effect if entry.name == "lever_arm").parameters["x"]
     assert arm.value == pytest.approx(0.05)
@@ -179,11 +182,16 @@ def _lines(*f_hz: float) -> tuple[Entry, ...]:
 def test_a_scale_that_sets_in_is_none_of_the_whole_simulation(tmp_path: Path) -> None:
     values = {"x": Value(value=0.02, unit="-"), "t_step": Value(value=20.0, unit="s")}
     later = Entry(name="gyro_scale", signal="gyro", parameters=values)
-    physics_file.write(PhysicsFile(effect=(later,)), tmp_path / "physics.toml")
+    term = Term(signal="accel", term="omega_x omega_y", value=(0.2, 0.0, -0.1))
+    curve = Curve(signal="gyro", variable="f_x", unit="m/s²", x=(-3.0, 0.0, 3.0), y=((0.06, 0.0, 0.0),) * 3)
+    physics_file.write(PhysicsFile(effect=(later,), term=(term,), unknown=(curve,)), tmp_path / "physics.toml")
     datasheet.write(NOISE, tmp_path / "noise.toml")
     twin = read(tmp_path)
     assert not twin.vector("gyro_scale").any()
-    assert export(tmp_path, tmp_path / "out", format="mujoco").left_out[0] == "gyro_scale"
+    assert twin.ranges()["gyro_scale.x"][:3] == (0.02, 0.02, 0.02)
+    assert twin.ranges()["gyro_bias.x"][:3] == (0.0, 0.0, 0.0), "nothing is known of it"
+    left_out = export(tmp_path, tmp_path / "out", format="mujoco").left_out
+    assert left_out == ["gyro_scale", "a curve of f_x", "omega_x omega_y", "the colour of the noise"]
 
 
 def test_two_lines_of_a_vibration_stay_two(tmp_path: Path) -> None:
@@ -197,9 +205,22 @@ def test_two_lines_of_a_vibration_stay_two(tmp_path: Path) -> None:
     report = export(tmp_path / "fleet", tmp_path / "out", format="mujoco")
     found = physics_file.read(tmp_path / "out" / "physics.toml").effect
     assert [entry.parameters["f"].value for entry in found] == [31.0, 91.0]
+    assert [entry.parameters["f"].std for entry in found] == [pytest.approx(np.sqrt(2.0))] * 2
     assert report.left_out[-2:] == ["gyro_bias_step of 2 of 2 units", "gyro_scale of 1 of 2 units"]
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "imu.xml"))
     assert [model.numeric(f"imu.vibration_accel{n}.f").data[0] for n in ("", "_2")] == [31.0, 91.0]
+
+
+def test_lines_of_two_sensors_are_two_effects(tmp_path: Path) -> None:
+    """Whichever is the faster in a unit."""
+    for name, of_gyro, of_accel in (("a", 90.0, 30.0), ("b", 34.0, 94.0)):
+        (line,) = _lines(of_accel)
+        (tmp_path / "fleet" / name).mkdir(parents=True)
+        other = msgspec.structs.replace(line, signal="gyro", parameters={"f": Value(value=of_gyro, unit="Hz")})
+        physics_file.write(PhysicsFile(effect=(line, other)), tmp_path / "fleet" / name / "physics.toml")
+        datasheet.write(NOISE, tmp_path / "fleet" / name / "noise.toml")
+    found = read(tmp_path / "fleet").physics.effect
+    assert {entry.signal: entry.parameters["f"].value for entry in found} == {"accel": 62.0, "gyro": 62.0}
 
 
 def test_what_is_no_diagnosis_is_refused(tmp_path: Path) -> None:

@@ -81,6 +81,22 @@ def test_biases_do_not_depend_on_the_heading(heading: float) -> None:
     np.testing.assert_allclose(other.R_wb, turn @ one.R_wb, rtol=0, atol=EXACT)
 
 
+@pytest.mark.parametrize(("rate", "missing_s"), [(0.0, 0.0), (2.0, 0.0), (0.0, 0.01)])
+def test_noise_of_the_samples_grows_as_white_noise_does_when_it_is_integrated(rate: float, missing_s: float) -> None:
+    """From a state that is exact: angle and velocity by the time, position by its cube (a third, of which a quarter counts)."""
+    x, T = start(), 0.5
+    x = x._replace(P=np.zeros_like(x.P))
+    gyro, accel = np.tile(rate * x.R_wb[2], (101, 1)), np.tile(9.81 * x.R_wb[2], (101, 1))  # level, it turns about the vertical
+    P = motion_step(x, integrate(np.arange(101) / 200.0, gyro, accel), gyro[-1], missing_s, np.zeros(6), S).expected.P
+    turn = S.gyro_density**2 * T + (S.gyro_scale * rate * T) ** 2 + (inertial_filter.MISSING_RAD_S * missing_s) ** 2
+    push = S.accel_density**2 * T + (inertial_filter.MISSING_M_S2 * missing_s) ** 2
+    np.testing.assert_allclose(P[:3, :3], turn * np.eye(3), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(P[VELOCITY, VELOCITY], push * np.eye(3), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(P[VELOCITY, POSITION], 0.5 * T * push * np.eye(3), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(np.diag(P[POSITION, POSITION]), 0.25 * T**2 * push, rtol=1e-6)
+    assert np.diag(P)[9:].max() <= 1.01 * inertial_filter.MIN_VARIANCE
+
+
 def test_heading_is_never_found_out() -> None:
     """A heading error shows in no measurement: as large as at the start whatever is measured."""
     x = start()
@@ -148,8 +164,11 @@ def test_smoothing_a_linear_case_is_least_squares() -> None:
     A = np.array([[1, 0, 0, 0], [0, 0, 0, 1], [-1, 1, 0, 0], [0, -1, 1, 0], [0, 1, 0, 1], [0, 0, 1, 1]], float)
     y = np.array([0, 0, 0, 0, 1e-3, 2e-3])
     w = 1 / np.array([STD[0] ** 2, STD[6] ** 2 + 2 * inertial_filter.MIN_VARIANCE, q, q, r, r])
-    solved = np.linalg.solve(A.T @ (w[:, None] * A), A.T @ (w * y))
+    covariance = np.linalg.inv(A.T @ (w[:, None] * A))
+    solved = covariance @ (A.T @ (w * y))
     np.testing.assert_allclose([s.bias[0] for s in smooth(found)], solved[:3], rtol=1e-3)
+    np.testing.assert_allclose([s.P[9, 9] for s in smooth(found)], np.diag(covariance)[:3], rtol=1e-3)
+    np.testing.assert_allclose([s.P[9, 15] for s in smooth(found)], covariance[:3, 3], rtol=1e-3)
 
 
 def test_a_stop_counts_in_full_however_fast_the_estimate() -> None:

@@ -38,9 +38,11 @@ def rising(t_ns: np.ndarray) -> np.ndarray:
 
 def test_words_are_aids_with_topics() -> None:
     assert parse_aids("stops, barometer=/baro.data") == {"stops": "", "barometer": "/baro.data"}
-    for wrong in ("stop", "stops=/a", "", "auto,gps"):
-        with pytest.raises(ConfigError, match="expected auto, or some of stops, barometer, odometry, ground"):
+    only = "Only barometer and odometry take a topic"  # of a word that has one in vain, and of no other
+    for wrong, fix in (("stop", "Did you mean stops?"), ("stops=/a", only), ("auto=/a", only), ("", ""), ("auto,gps", "")):
+        with pytest.raises(ConfigError, match="expected auto, or some of stops, barometer, odometry, ground") as refused:
             parse_aids(wrong)
+        assert refused.value.fix == fix
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1.0, "Pa"), (0.01, "hPa"), (0.001, "kPa")])

@@ -37,6 +37,17 @@ def test_white_noise_shows_no_walk() -> None:
     assert max(float(gains(residual(0.0, seed)).max()) for seed in range(10)) < 5.0
 
 
+def test_the_variance_of_the_white_noise_is_known_and_the_first_block_has_any_number() -> None:
+    x, one = residual(0.0), np.ones((1, SAMPLES))
+    found, later = (walk_likelihood(2.0 * x, one, np.arange(SAMPLES) // EACH + first, STEPS * EACH) for first in (0, 777))
+    assert found is not None
+    assert later is not None
+    assert found.white()[0] == pytest.approx(4.0, rel=0.3)  # of 240 blocks: three deviations
+    assert found.within == pytest.approx(4.0, rel=0.1)
+    for a, b in zip(found, later, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9)
+
+
 def test_a_walk_is_found_though_slow_effects_took_it_up() -> None:
     t = np.linspace(0.0, 1.0, SAMPLES)
     gained = gains(residual(1e-4), *(t**k for k in range(1, 6)))

@@ -64,3 +64,14 @@ def test_a_recording_of_seconds_has_no_colour_and_a_colour_belongs_to_its_rate()
     assert colour is not None
     assert colour.holds_at(200.5)
     assert not colour.holds_at(100.0)
+
+
+def test_noise_of_which_the_expected_signal_has_a_part_is_drawn_without_that_part() -> None:
+    rng = np.random.default_rng(4)
+    t_s, motion, _ = _made(rng)
+    recorded, expected = (motion + std * rng.normal(size=motion.shape) for std in (0.5, 0.3))
+    std = (recorded - expected).std(axis=0)
+    colour = measured([(t_s, recorded, expected)], std, RATE_HZ)
+    assert colour is not None
+    drawn = colour.drawn(t_s, expected, rng) * std
+    np.testing.assert_allclose(drawn.std(axis=0), np.sqrt(0.5**2 - 0.3**2), rtol=0.1)

@@ -110,6 +110,24 @@ def test_landmarks_lie_on_the_six_sides_of_a_room_around_the_way(poses: Poses) -
     assert (points <= high).all()
 
 
+def test_landmarks_are_as_dense_on_each_side_of_a_room() -> None:
+    count, size = 40_000, np.array([12.0, 6.0, 3.0])
+    points = room(np.array([[0.0, 0.0, 0.0], size - 2.0]), np.random.default_rng(0), count=count, margin_m=1.0) + 1.0
+    on = np.concatenate([(points == 0.0).sum(axis=0), (points == size).sum(axis=0)])
+    area = np.tile([6.0 * 3.0, 12.0 * 3.0, 12.0 * 6.0], 2)
+    expected = count * area / area.sum()
+    np.testing.assert_array_less(np.abs(on - expected), 4.0 * np.sqrt(expected))
+
+
+def test_the_outermost_pixels_are_in_view_and_those_beyond_are_not() -> None:
+    right, below = EUROC.width - 1.0, EUROC.height - 1.0
+    inside, off = np.array([[0.0, 0.0, 0.0], [right, right, below]]), 1e-6
+    assert EUROC.in_view(inside).all()
+    for column in range(3):
+        beyond = inside + off * np.array([[-1.0], [1.0]]) * np.eye(3)[column]
+        assert not EUROC.in_view(beyond).any(), column
+
+
 def test_the_seed_decides(poses: Poses) -> None:
     first, again, other = (see(poses, 1.0, seed)[0] for seed in (1, 1, 2))
     assert all(np.array_equal(a.pixels, b.pixels) for a, b in zip(first, again, strict=True))

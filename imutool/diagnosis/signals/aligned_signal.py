@@ -75,6 +75,11 @@ class AlignedSignal(AlignedLog):
         """Unit of a column."""
         return self.units[self.names.index(signal)]
 
+    def joint(self, state: str) -> str:
+        """Index in the message of the joint that a state, as `dq0`, belongs to."""
+        number = state.lstrip("dq")
+        return self.names[int(number)].rpartition("[")[2].rstrip("]") if number.isdigit() else ""
+
     def variables(self) -> Variables:
         """Values, rates of change, the state, time and the channels of the log."""
         sampled, out = self.sampled, {}
@@ -85,11 +90,9 @@ class AlignedSignal(AlignedLog):
             out[f"{of} size"] = unit, np.abs(x - np.median(x))
             out[f"{of} rate of change"] = f"{unit}/s", np.abs(sampled.dx[:, k])
         out["time"] = "s", self.stamp_s
-        out |= {
-            STATE_WORDS.get(name.rstrip("0123456789"), "{}").format(name[-1]): ("", np.abs(values))
-            for name, values in sampled.state.items()
-            if name.rstrip("0123456789") in STATE_WORDS
-        }
+        for name, values in sampled.state.items():
+            if (words := STATE_WORDS.get(name.rstrip("0123456789"))) is not None:
+                out[words.format(self.joint(name))] = "", np.abs(values)
         channels = self.ideal.channels.items()
         return out | {name: ("", np.interp(self.stamp_s, at_s, values)) for name, (at_s, values) in channels}
 

@@ -231,7 +231,8 @@ def _summarized(
     selection, small = above_model_error(log, selection)
     before, after = with_effects(pair, ()), with_effects(pair, selection.whole.chosen)
     similar = selection.similar()
-    findings = [_with_python(finding_of(logs, selection, selected, level, similar)) for selected in selection.selected]
+    found = ((finding_of(logs, selection, selected, level, similar), selected.effect) for selected in selection.selected)
+    findings = [msgspec.structs.replace(f, python=python(effect, f.signal.rpartition(".")[2])) for f, effect in found]
     if pair.band_hz is not None:  # dynamics that were learnt are known to a share
         errors = learnt_errors(log, selection.whole)
         each = zip(findings, selection.selected, strict=True)
@@ -273,13 +274,6 @@ def _summarized(
         },
         clock_s=pair.aligned_s,
     )
-
-
-def _with_python(finding: Finding) -> Finding:
-    """A finding with its equation as Python."""
-    if finding.kind != "unknown" or finding.curve is not None:
-        return finding
-    return msgspec.structs.replace(finding, python=python(finding.variable, finding.signal.rpartition(".")[2]))
 
 
 def _unseen(log: WhitenedLog, candidates: Sequence[Effect], selection: Selection, settings: DiagnoseSettings) -> Iterator[str]:

@@ -228,7 +228,9 @@ def test_the_deviation_of_a_turn_knows_what_holds_it_back() -> None:
     """Without noise it was a thousandth of the error."""
     motion, t = bench.Motion.drawn(np.random.default_rng(5)), np.arange(3200) / 200.0
     samples = np.concatenate([motion.rate(t) @ TURN.T, motion.force(t) @ TURN.T], axis=1)
-    for fault in simulator_faults(bench._log(motion, t, samples), None, Noise()):
+    faults = simulator_faults(bench._log(motion, t, samples), None, Noise())
+    assert faults
+    for fault in faults:
         off = [abs(fault.parameters[a].value - true) / fault.parameters[a].std for a, true in zip("xyz", TURN_RAD, strict=True)]
         assert max(off) < 4.0
 
