@@ -154,7 +154,10 @@ def as_messages(made: Recording, kind: str, target: Path) -> Path:
 @pytest.mark.parametrize("kind", ["nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped"])
 def test_a_turned_body_of_poses_that_name_it_comes_back(kind: str, made: Recording, tmp_path: Path) -> None:
     """Without a tree of frames next to them: a Vicon bridge's topic, an INS's odometry, whose twist is in the body's axes."""
-    turn, true = Rotation.from_euler("z", 180.0, degrees=True), Rotation.from_quat(made.truth.q_wb_wxyz.copy(), scalar_first=True)
+    turn, true = (
+        Rotation.from_euler("z", 180.0, degrees=True),
+        Rotation.from_quat(made.truth.q_wb_wxyz.copy(), scalar_first=True),
+    )
     turned = replace(made.truth, q_wb_wxyz=(true * turn).as_quat(scalar_first=True))
     log = as_messages(replace(made, truths={"/ground_truth/pose": turned}), kind, tmp_path / "turned.mcap")
     convert(log, tmp_path / "straight.mcap", fix=True)
@@ -163,9 +166,13 @@ def test_a_turned_body_of_poses_that_name_it_comes_back(kind: str, made: Recordi
     assert inspect(tmp_path / "straight.mcap").warnings == []
     if kind.endswith("Odometry"):
         with (tmp_path / "straight.mcap").open("rb") as file:
-            (_, _, _, odometry), *_ = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(["/gt/body"])
+            (_, _, _, odometry), *_ = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(
+                ["/gt/body"]
+            )
         velocity, rate = odometry.twist.twist.linear, odometry.twist.twist.angular
-        np.testing.assert_allclose([velocity.x, velocity.y, velocity.z, rate.x, rate.y, rate.z], [-1, -2, 3, -4, -5, 6], atol=1e-12)
+        np.testing.assert_allclose(
+            [velocity.x, velocity.y, velocity.z, rate.x, rate.y, rate.z], [-1, -2, 3, -4, -5, 6], atol=1e-12
+        )
         np.testing.assert_allclose(odometry.twist.covariance[::7], np.arange(1.0, 7.0), atol=1e-12)
 
 
