@@ -19,7 +19,7 @@ from imutool.cleaning.likelihood import BLOCKS_S, CLEARLY, FEWEST_BLOCKS, SURE, 
 from imutool.cleaning.pose_delay import Delay, StepIntegral, pose_delay, usable
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, is_other_world, left_when_turned, read_right
 from imutool.cleaning.position_unit import POSITIONS, Misfits, position_unit
-from imutool.cleaning.samples import STEP_S, Motion
+from imutool.cleaning.samples import STEP_S, Motion, turns
 from imutool.cleaning.truth import Truth, axis_of_gravity, best_rotation, force_in_world, rotation_deg, stays_level, turning
 from imutool.cleaning.unit_evidence import RATES
 from imutool.geometry import quaternion
@@ -27,8 +27,7 @@ from imutool.recording import GRAVITY_M_S2, interpolate
 from imutool.recording.columns import median, quantile
 
 SECOND_AXIS = 0.15  # of the rate about the main axis, that about the second at least: more than a tilted mount leaks
-WINDOW = 5  # steps of 0.1 s over which the gyro must carry gravity along
-MAX_WINDOWS = 600  # evenly taken from a longer log
+WINDOW, MAX_WINDOWS = 5, 600  # steps of 0.1 s over which the gyro must carry gravity along; windows evenly taken from a log
 TURNING = 0.4  # of the turn of the liveliest tenth of the windows, that of a window that counts
 STRAIGHT_DEG = 15.0  # three deviations above a rotation between gyro and poses that leaves no other order of the axes
 MIN_MEAN_S = 10.0  # in which a vehicle that gains 10 m/s upwards changes the mean by a tenth of gravity
@@ -217,13 +216,14 @@ def _gyro_against_poses(
 def _rates(
     step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m 6"], start_ns: int, truth: Truth
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Rates of the poses and of the gyro over the same times, each without its median, and the ends of these (s)."""
+    """Rates of the poses and of the gyro over the same times of turns, each without its median; the ends of these (s)."""
     first, last, rate = turning(truth)
     use, first_s, last_s = usable(first, last, start_ns, step)
     if not len(use):
         return rate[:0], rate[:0], first_s, last_s
     measured = StepIntegral.of(step, mean[:, :3]).between(first_s, last_s)
-    return rate[use] - median(rate[use]), measured - median(measured), first_s, last_s
+    rows = turns(rate := rate[use] - median(rate[use]))
+    return rate[rows], measured[rows] - median(measured), first_s[rows], last_s[rows]
 
 
 def _nearest(choice: Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:

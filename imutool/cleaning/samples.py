@@ -16,10 +16,12 @@ from imutool.mcap_io.codec import messages
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
 from imutool.recording import nanoseconds
+from imutool.recording.columns import quantile
 
 BLOCK = 4096  # samples: what rules see at a time depends on the log alone, not on how its chunks were cut
 STEP_NS = nanoseconds(0.1)
 STEP_S = 0.1  # of `Motion`
+RESTING = 0.1  # of the rate that a tenth of a log exceeds: the largest of rest
 MAX_FRAMES = 4  # that a warning names
 FIRST_MESSAGES = 1000  # that show whether sensors take turns
 FEW_CHANGES, MAX_CHANGES = 10, 0.01  # of the frame, the second by messages: more are of sensors that take turns
@@ -227,3 +229,9 @@ class Motion:
             self._steps, self._sums = [], []
             self._mean = step, total[:, 1:] / total[:, :1]
         return self._mean
+
+
+def turns(rate: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Rows that turn: rest shows no axes, and a robot's arm may rest for most of a log."""
+    size = np.linalg.norm(rate, axis=1)
+    return np.asarray(size >= RESTING * (quantile(size, 0.9) if len(size) else 0.0))

@@ -13,7 +13,7 @@ from msgspec import convert, field
 from imutool.bias_start import Fitness
 from imutool.cli.app import COMMON, Aid, Common, Imu, Init, Logs, Models, ReportPage, Set, Smooth, Truth, Written, app
 from imutool.cli.terminal import figures, kept_for_end, raise_kept, say, table
-from imutool.errors import ConfigError, ImutoolError
+from imutool.errors import ConfigError, ImutoolError, ModelError
 from imutool.report import UNSET, Report, Section, UnsetType
 
 ALIGNED_HELP = (
@@ -92,8 +92,8 @@ def evaluate(
 ) -> None:
     """Integrate the IMU from the true start, raw and debiased, and compare it with the truth.
 
-    Without --model the debiased samples of the log are scored, if it has them. A model that does not apply to a log, and
-    a log of several that is not usable, are named at the end, after the scores of the others.
+    Without --model the debiased samples of the log are scored, if it has them. A model that does not apply to a log or does
+    not fit it, and a log of several that is not usable, are named at the end, after the scores of the others.
     """
     from imutool.evaluation import evaluate as run
 
@@ -133,7 +133,7 @@ def evaluate(
         figures(rows, aligned=aligned)
         for sentence in [*_used(results), *_late(results), *_fits(results), *([] if report is None else [f"Report: {report}"])]:
             say(sentence)
-    raise_kept(errors)
+    raise_kept([*errors, *_unfit(results)])
 
 
 def _refuse_one_name(logs: Sequence[Path]) -> None:
@@ -157,6 +157,13 @@ def _fits(results: Sequence[dict[str, Any]]) -> list[str]:
     """Sentences about the models that may not fit a log."""
     rows = [row for row in results if row["estimate"] == "integration" and row["fit"] and row["fit"]["verdict"] != "fits"]
     return [f"{row['log']}: {convert(row['fit'], Fitness).sentence(row['model'])}" for row in rows]
+
+
+def _unfit(results: Sequence[dict[str, Any]]) -> list[ImutoolError]:
+    """Errors of scored models that `debias` would refuse."""
+    rows = [row for row in results if row["estimate"] == "integration" and row["fit"] and row["fit"]["verdict"] == "unfit"]
+    what, fix = "the model {model!r} does not fit this log, by its samples; the scores are in the report", "Choose another model"
+    return [ModelError(what.format_map(row), where=row["log"], expected="a model of this sensor", fix=fix) for row in rows]
 
 
 def _late(results: Sequence[dict[str, Any]]) -> list[str]:

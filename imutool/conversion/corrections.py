@@ -187,8 +187,11 @@ class Corrections:
             q_wxyz = numbers[schemas.XYZW][WXYZ_FROM_XYZW]
             if judged and self.quaternions:
                 q_wxyz = read_right(self.quaternions, q_wxyz[None])[0]
-            if patch.layout.texts[2 * which + 1] in self.body.frames if named == 2 else topic.name == self.pose_topic:
+            own = topic.name == self.pose_topic and patch.schema_name != schemas.TF  # a tree has bodies of its own
+            if own or (named == 2 and patch.layout.texts[2 * which + 1] in self.body.frames):
                 q_wxyz = body @ q_wxyz
+                if patch.schema_name == schemas.ODOMETRY:
+                    _turn_twist(numbers, self.body.turn)
             numbers[schemas.XYZW] = (turn @ q_wxyz)[XYZW_FROM_WXYZ]
 
 
@@ -219,6 +222,13 @@ class _MessagePatch:
             what = f"a stamp of {moved_ns - by_ns} ns, moved by {by_ns} ns, does not fit its field"
             fix = "Cut the log there, or convert it to ROS 2 first" if moved_ns < 0 else "Cut the log there"
             raise DataError(what, expected="stamps that ROS can store", fix=fix) from error
+
+
+def _turn_twist(numbers: np.ndarray, turn: Float64[np.ndarray, "3 3"]) -> None:
+    """Turn the twist of an Odometry message, which is in the axes of its body."""
+    both, twist, covariance = np.kron(np.eye(2), turn), schemas.TWIST_OF_ODOMETRY, schemas.TWIST_COVARIANCE
+    numbers[twist] = both @ numbers[twist]
+    numbers[covariance] = (both @ numbers[covariance].reshape(6, 6) @ both.T).reshape(-1)
 
 
 def _corrected_imu(patch: _MessagePatch, gyro: Float64[np.ndarray, "3 3"], accel: Float64[np.ndarray, "3 3"]) -> bytes:

@@ -149,16 +149,40 @@ def slerp(a: Quaternions, b: Quaternions, share: Column) -> Quaternions:
     return np.asarray(to_a * a + to_b * b)
 
 
-def between_rows(q: Float64[np.ndarray, "m 4"], after: Int64[np.ndarray, " n"], share: Column) -> Quaternions:
-    """Unit quaternions between rows, by slerp in blocks.
+def between_rows(
+    q: Float64[np.ndarray, "m 4"],
+    after: Int64[np.ndarray, " n"],
+    share: Column,
+    t_s: Float64[np.ndarray, " m"] | None = None,
+) -> Quaternions:
+    """Unit quaternions between rows, by slerp in blocks, or along a curve where the times of the rows are given.
 
-    From the row before `after` (share 0) to the row `after` (share 1).
+    From the row before `after` (share 0) to the row `after` (share 1). The curve is the cubic of the rotation vector whose
+    rates at both ends are those of parabolas through three rows: slerp over h makes turns of frequency f too small by the share
+    (2 pi f h)^2 / 12.
     """
+    rates = None if t_s is None else _rates_at_rows(q, t_s)
     out = np.empty((len(after), 4))
-    for first in range(0, len(after), ROWS_AT_ONCE):
-        rows = slice(first, first + ROWS_AT_ONCE)
-        out[rows] = unit(slerp(q[after[rows] - 1], q[after[rows]], share[rows]))
+    for block in range(0, len(after), ROWS_AT_ONCE):
+        rows = slice(block, block + ROWS_AT_ONCE)
+        last, u = after[rows], share[rows]
+        if rates is None or t_s is None:
+            out[rows] = unit(slerp(q[last - 1], q[last], u))
+            continue
+        u, h = u[:, None], (t_s[last] - t_s[last - 1])[:, None]
+        turn, starts, ends = log(multiply(inverse(q[last - 1]), q[last])), h * rates[last - 1], h * rates[last]
+        ends = ends + 0.5 * np.cross(turn, ends)  # the inverse right Jacobian of the turn, to first order
+        vector = (3.0 - 2.0 * u) * u**2 * turn + (1.0 - u) * u * ((1.0 - u) * starts - u * ends)
+        out[rows] = unit(multiply(q[last - 1], exp(vector)))
     return out
+
+
+def _rates_at_rows(q: Float64[np.ndarray, "m 4"], t_s: Float64[np.ndarray, " m"]) -> Vectors:
+    """Angular rates (body) at rows, of parabolas through each and its neighbours; a step across a gap counts little."""
+    dt = np.diff(t_s)[:, None]
+    steps = log(multiply(inverse(q[:-1]), q[1:])) / dt
+    inner = (dt[1:] * steps[:-1] + dt[:-1] * steps[1:]) / (dt[1:] + dt[:-1])
+    return np.concatenate([steps[:1], inner, steps[-1:]])
 
 
 @_in_blocks

@@ -22,8 +22,8 @@ from imutool.recording.columns import Columns, checked_mapping, clock_jumps, con
 GRAVITY_M_S2 = 9.81
 UNIT_QUATERNION_TOLERANCE = 1e-6  # six printed decimals, as in the normalised EuRoC truth
 TURNED = 0.1  # change of a quaternion's component: a body that turns so far moves as well
-GAP_FACTOR = 4.0  # length of a gap in the truth, in median periods
-MIN_GAP_S = 0.08  # least length of a gap: a 20 Hz truth, and the 70 ms jitter of FETCH, have no gap
+GAP_FACTOR, MIN_GAP_S = 4.0, 0.08  # length of a gap in the truth, in median periods, and its least: FETCH jitters by 70 ms
+MAX_STRAIGHT_S = 0.015  # median period of poses between which slerp makes a turn of 4 Hz too small by 1 % at most
 MIN_PERIOD_S = 20e-6  # an IMU has at most 32 kHz; stamps in microseconds taken for nanoseconds are closer from 50 Hz on
 
 Times = Int64[np.ndarray, " n"]
@@ -99,9 +99,9 @@ class Poses(Columns):
     def at(self, t_ns: Times, max_gap_s: float | None = None) -> tuple[Poses, Bool[np.ndarray, " n"]]:
         """Poses interpolated at other times, and a mask of the valid ones.
 
-        Position (and velocity) linearly, orientation by slerp along the shorter arc. The mask is false before the first
-        pose, after the last, and inside a gap longer than `max_gap_s` (by default four median periods, at least
-        80 ms). Masked rows hold the pose of the end or the interpolation across the gap.
+        Position (and velocity) linearly, orientation by slerp along the shorter arc; by a cubic where poses are further apart
+        than `MAX_STRAIGHT_S`. The mask is false before the first pose, after the last, and inside a gap longer than
+        `max_gap_s` (by default four median periods, at least 80 ms). Masked rows hold the pose of the end or the interpolation.
 
         Raises:
             DataError: fewer than two poses.
@@ -119,7 +119,8 @@ class Poses(Columns):
 
         start = int(self.t_ns[0])
         knots, wanted = seconds(self.t_ns, start), seconds(clipped, start)
-        q_wb_wxyz = quaternion.between_rows(self.q_wb_wxyz, after, (clipped - self.t_ns[after - 1]) / span_ns)
+        share, curved = (clipped - self.t_ns[after - 1]) / span_ns, knots if self.period_s > MAX_STRAIGHT_S else None
+        q_wb_wxyz = quaternion.between_rows(self.q_wb_wxyz, after, share, curved)
         p_wb = interpolate(wanted, knots, self.p_wb)
         v_w = None if self.v_w is None else interpolate(wanted, knots, self.v_w)
         for column in (q_wb_wxyz, p_wb, *([] if v_w is None else [v_w])):  # so that the poses need no copy

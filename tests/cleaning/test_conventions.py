@@ -543,3 +543,16 @@ def test_misfits_of_all_readings_at_once_are_those_of_each_and_averages_are_of_t
         np.testing.assert_array_equal(size, np.linalg.norm(each, axis=1))
         mean = np.stack([np.convolve(column, triangle, mode="valid") for column in each.T], axis=1)
         np.testing.assert_allclose(averaged, np.linalg.norm(mean, axis=1), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("axes", [np.diag([1.0, -1.0, 1.0]), PERMUTATIONS[9]], ids=["mirrored", "permuted"])
+def test_a_log_that_rests_for_most_of_the_time_shows_the_axes_of_the_gyro(axes: np.ndarray) -> None:
+    """A robot's arm moves for three seconds and stops for five."""
+    omega = waves(96.0, (0.5, 0.4, 0.6)) * (np.arange(9600) % 800 < 300)[:, None]
+    imu, poses = turned(omega)
+    truth = of_poses("/ground_truth/pose", poses)
+    assert truth is not None
+    found = judge(motion_of(Imu(imu.t_ns, imu.gyro @ axes, imu.accel)), truth, 1.0).gyro
+    assert found is not None
+    assert found.wrong
+    assert (found.axes == axes).all()

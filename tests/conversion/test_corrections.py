@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
@@ -32,7 +33,7 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording
-from imutool.recording.message_log import Message, MessageLog
+from imutool.recording.message_log import Message, MessageLog, MessageTopic
 from imutool.sensor.made_up_flight import flight
 
 P = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
@@ -123,6 +124,56 @@ def test_a_turned_body_of_the_poses_comes_back_to_the_imu(made: Recording, tmp_p
     with Log(tmp_path / "straight.mcap") as log:
         transforms = np.concatenate([batch.q_wb_wxyz for batch in log.pose_batches("/tf")])
     np.testing.assert_allclose(np.abs((transforms * fixed.truth.q_wb_wxyz).sum(axis=1)), 1.0, atol=1e-9)
+
+
+def as_messages(made: Recording, kind: str, target: Path) -> Path:
+    """Log of an IMU beside poses as messages that name their body, in ROS 2."""
+    types = (store := get_typestore(Stores.ROS2_HUMBLE)).types
+    vector, point = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Point"]
+
+    def message(t_ns: int, p: list[float], q: list[float]) -> object:
+        header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(t_ns, 10**9)), "map")
+        orientation = types["geometry_msgs/msg/Quaternion"](*q[1:], q[0])
+        if kind == "geometry_msgs/msg/TransformStamped":
+            return types[kind](header, "body", types["geometry_msgs/msg/Transform"](vector(*p), orientation))
+        pose, twist = types["geometry_msgs/msg/Pose"](point(*p), orientation), types["geometry_msgs/msg/Twist"]
+        known, of_twist = (types[f"geometry_msgs/msg/{name}WithCovariance"] for name in ("Pose", "Twist"))
+        moving = twist(vector(1.0, 2.0, 3.0), vector(4.0, 5.0, 6.0))
+        return types[kind](header, "body", known(pose, np.zeros(36)), of_twist(moving, np.diag(np.arange(1.0, 7.0)).ravel()))
+
+    write(replace(made, truths={}), target)
+    content = (module := registry.load("imutool.converters", "mcap_log")).read_sequence(next(iter(module.sequences(target))))
+    topic = MessageTopic("/gt/body", kind, "ros2msg", store.generate_msgdef(kind, ros_version=2)[0].encode(), "cdr")
+    rows = zip(made.truth.t_ns.tolist(), made.truth.p_wb.tolist(), made.truth.q_wb_wxyz.tolist(), strict=True)
+    poses = [Message(topic, t, t, bytes(store.serialize_cdr(message(t, p, q), kind))) for t, p, q in rows]
+    both = sorted([*content.messages(), *poses], key=lambda each: each.log_time)
+    write_log(replace(content, messages=lambda: iter(both)), target, compression="none", overwrite=True)
+    return target
+
+
+@pytest.mark.parametrize("kind", ["nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped"])
+def test_a_turned_body_of_poses_that_name_it_comes_back(kind: str, made: Recording, tmp_path: Path) -> None:
+    """Without a tree of frames next to them: a Vicon bridge's topic, an INS's odometry, whose twist is in the body's axes."""
+    turn, true = (
+        Rotation.from_euler("z", 180.0, degrees=True),
+        Rotation.from_quat(made.truth.q_wb_wxyz.copy(), scalar_first=True),
+    )
+    turned = replace(made.truth, q_wb_wxyz=(true * turn).as_quat(scalar_first=True))
+    log = as_messages(replace(made, truths={"/ground_truth/pose": turned}), kind, tmp_path / "turned.mcap")
+    convert(log, tmp_path / "straight.mcap", fix=True)
+    fixed = Rotation.from_quat(read(tmp_path / "straight.mcap").truth.q_wb_wxyz.copy(), scalar_first=True)
+    assert np.degrees((fixed * true.inv()).magnitude()).max() < 1e-5
+    assert inspect(tmp_path / "straight.mcap").warnings == []
+    if kind.endswith("Odometry"):
+        with (tmp_path / "straight.mcap").open("rb") as file:
+            (_, _, _, odometry), *_ = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(
+                ["/gt/body"]
+            )
+        velocity, rate = odometry.twist.twist.linear, odometry.twist.twist.angular
+        np.testing.assert_allclose(
+            [velocity.x, velocity.y, velocity.z, rate.x, rate.y, rate.z], [-1, -2, 3, -4, -5, 6], atol=1e-12
+        )
+        np.testing.assert_allclose(odometry.twist.covariance[::7], np.arange(1.0, 7.0), atol=1e-12)
 
 
 def test_quaternions_in_ned_beside_positions_in_enu_come_back(made: Recording, tmp_path: Path) -> None:

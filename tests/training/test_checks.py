@@ -115,6 +115,12 @@ def test_poses_that_are_means_over_some_time_are_named(
     assert ("smoothed over about 0.39 s" in caplog.text) == ("smoothed" in caplog.text) == (over_s > 0.0), caplog.text
 
 
+def test_poses_that_are_far_apart_are_not_called_smoothed(caplog: pytest.LogCaptureFixture) -> None:
+    """A GNSS and INS, or a lidar: on straight lines between its poses a turn is too small, as if they were means."""
+    warn_of_smoothed_poses(Pool.of([flight(1, duration_s=60.0, rate_hz=100.0, truth_rate_hz=5.0, attitude_knot_s=0.35)]))
+    assert "smoothed" not in caplog.text
+
+
 def test_stamps_in_batches_are_refused_before_the_poses_clock_that_they_seem_to_shift(flown: Recording) -> None:
     imu, row = flown.imu, np.arange(len(flown.imu))
     stamps = imu.t_ns[np.minimum(row // 5 * 5 + 4, len(imu) - 1)] + 100_000 * (row % 5)

@@ -134,6 +134,7 @@ ORIENTATION, ORIENTATION_COVARIANCE = slice(0, 4), slice(4, 13)
 GYRO, GYRO_COVARIANCE = slice(13, 16), slice(16, 25)
 ACCEL, ACCEL_COVARIANCE = slice(25, 28), slice(28, 37)
 POSITION, XYZW = slice(0, 3), slice(3, 7)
+TWIST_OF_ODOMETRY, TWIST_COVARIANCE = slice(43, 49), slice(49, 85)
 
 
 @dataclass(frozen=True, slots=True)
