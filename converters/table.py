@@ -42,7 +42,7 @@ from ._tables.columns.map import (
     vectors_named,
     within_groups,
 )
-from ._tables.columns.motion import settle_accel_unit
+from ._tables.columns.motion import settle_accel_unit, sign_doubts
 from ._tables.columns.pose_names import rotations_named, why_no_poses
 from ._tables.columns.propose import propose, without_copies
 from ._tables.columns.rotations import known_rotations, unit_by_poses
@@ -88,6 +88,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
     tables = [_clocked(columns, table, place) for table in tables]
     for each in (each for each in tables if each.rate_hz):
         refuse_joined(columns, columns.unsigned(each.gyro[0]), place)
+    remarks.doubt([doubt for each in tables if "accel" not in given for doubt in sign_doubts(path, each)])
     table = tables[0]  # other columns are on its clock
     turns = *table.quaternion_wxyz, *table.roll_pitch_yaw, *matrix_columns(table.rotation_matrix)
     true = {table.truth_time, *table.position, *turns}

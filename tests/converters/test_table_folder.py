@@ -662,3 +662,42 @@ def test_tables_in_log_files_and_those_of_programs_that_are_none(tmp_path):
     (tmp_path / "debug.log").write_text("".join(said))
     (found,) = table.sequences(tmp_path)
     assert found.path == tmp_path / "imu.csv"
+
+
+def test_a_sequence_of_mulran_is_an_imu_beside_its_poses(tmp_path):
+    """Neither table has a header: time, quaternion, angles, rates, forces, magnetic field; time, and a matrix row by row."""
+    t_ns = 1_564_718_964 * 10**9 + np.arange(8 * COUNT) * 10**7
+    t_s = (t_ns - t_ns[0]) / 1e9
+    rotation = Rotation.from_rotvec(np.outer(0.4 * np.sin(1.1 * t_s), [1.0, 0.0, 0.0]))
+    gyro, accel = np.outer(0.44 * np.cos(1.1 * t_s), [1.0, 0.0, 0.0]), rotation.inv().apply([0.0, 0.0, 9.81])
+    position = np.array([354e3, 4025e3, 20.0]) + RNG.normal(size=(len(t_s), 3))
+    field = np.tile([0.2, 0.1, 0.4], (len(t_s), 1))
+    xsens = np.concatenate([rotation.as_quat(), rotation.as_euler("xyz"), gyro, accel, field], axis=1)
+    rigid = np.concatenate([rotation.as_matrix(), position[:, :, None]], axis=2).reshape(-1, 12)
+    for name, table_of in (("xsens_imu.csv", xsens), ("global_pose.csv", rigid)):
+        lines = (f"{t},{','.join(map(repr, row))}\n" for t, row in zip(t_ns.tolist(), table_of.tolist(), strict=True))
+        (tmp_path / name).write_text("".join(lines))
+    (sequence,) = table.sequences(tmp_path)
+    log = table.read_sequence(sequence)
+    assert np.array_equal(log.imus["/imu0"].t_ns, t_ns)
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, gyro)
+    np.testing.assert_allclose(log.imus["/imu0"].accel, accel)
+    poses = log.poses["/estimate/pose"]
+    assert np.array_equal(poses.t_ns, t_ns)
+    np.testing.assert_allclose(poses.p_wb, position)
+    assert (rotation.inv() * Rotation.from_quat(poses.q_wb_wxyz[:, [1, 2, 3, 0]])).magnitude().max() < 1e-6
+
+
+@pytest.mark.parametrize(("folder", "doubts"), [("iphone", 1), ("pixel", 0)])
+def test_the_sign_of_an_accelerometer_is_doubted_where_a_path_names_a_phone_of_apple(tmp_path, folder, doubts):
+    """ADVIO has the readings of an iPhone as they are: -1 g along the axis that points up."""
+    (tmp_path / folder).mkdir()
+    for name, values in (("gyro", GYRO), ("accelerometer", ACCEL / -9.81)):
+        (tmp_path / folder / f"{name}.csv").write_text(rows(T_S, values))
+    given = {"gyro_unit": "rad/s"}
+    log = table.read_sequence(table.sequences(tmp_path)[0], mapping=given)
+    assert sum("reads -1 g along the axis that points up" in doubt for doubt in log.remarks.doubts) == doubts
+    turned = [f"-accel/{axis}" for axis in "xyz"]
+    again = table.read_sequence(table.sequences(tmp_path)[0], mapping=given | {"accel": turned})
+    assert not again.remarks.doubts
+    np.testing.assert_allclose(again.imus["/imu0"].accel, -log.imus["/imu0"].accel)

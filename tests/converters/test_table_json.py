@@ -211,3 +211,25 @@ def test_lines_of_json_in_a_folder_are_a_table_and_have_true_poses_beside_them(t
     log = table.read_sequence(found, mapping={"gyro_unit": "rad/s"})
     assert log.kinds == {"/ground_truth/pose": "truth"}
     assert len(log.imus["/imu0"]) >= COUNT - 1
+
+
+@pytest.mark.parametrize("late", [0, 3000])
+def test_signals_of_a_bus_have_their_own_times(tmp_path, late):
+    """A2D2 has a list of times and values for each signal of a car, with units as data bases of Vector write them."""
+    t_us = 1_554_121_595_035_037 + 10_000 * np.arange(COUNT)
+    rates, unit = np.degrees(GYRO), "Unit_DegreOfArcPerSecon"
+    signals = {f"angular_velocity_omega_{a}": (late, unit, rates[:, n]) for n, a in enumerate("xyz")}
+    signals |= {f"acceleration_{a}": (0, "Unit_MeterPerSeconSquar", ACCEL[:, n]) for n, a in enumerate("xyz")}
+    signals["vehicle_speed"] = 777, None, np.arange(float(COUNT))
+    document = {
+        name: {"unit": unit, "values": [[t + later, value] for t, value in zip(t_us.tolist(), values.tolist(), strict=True)]}
+        for name, (later, unit, values) in signals.items()
+    }
+    (tmp_path / "bus_signals.json").write_text(json.dumps(document))
+    log = table.read_sequence(table.sequences(tmp_path / "bus_signals.json")[0])
+    count = COUNT - bool(late)  # behind the last force there is none to interpolate
+    assert np.array_equal(log.imus["/imu0"].t_ns, 1000 * (t_us + late)[:count])
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO[:count])
+    np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL[:count])
+    (speed,) = (scalars for topic, scalars in log.scalars.items() if "speed" in topic)
+    assert np.array_equal(speed.t_ns, 1000 * (t_us + 777))

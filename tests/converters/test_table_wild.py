@@ -1053,3 +1053,9 @@ def test_imus_of_one_table_share_the_unit_that_one_shows(tmp_path):
     np.testing.assert_allclose(imus["/right/imu"].gyro, np.deg2rad(hides))
     with pytest.raises(ConfigError, match="state no unit of the gyro"):
         read(write_csv(tmp_path / "one.csv", ["time [s]", *axes[6:]], [T_S, *hides.T, *ACCEL_G.T]))
+
+
+def test_android_s_names_of_chips_say_whether_they_wake_the_phone(tmp_path):
+    names = [f"icm4x6xx {sensor} Non-wakeup.{axis}" for sensor in ("Accelerometer", "Gyroscope") for axis in "xyz"]
+    log = read(write_csv(tmp_path / "imu.csv", ["Timestamp", *names], [1.6e12 + 1e3 * T_S, *ACCEL_G.T, *(COUNTS / 131).T]))
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, np.deg2rad(COUNTS / 131), rtol=1e-5)

@@ -39,6 +39,14 @@ CORE_MOTION = [  # of iOS, as OxIOD has it
     *(f"user_acceleration_{axis} [g]" for axis in "xyz"),
     *(f"magnetic_field_{axis}" for axis in "xyz"),
 ]
+XSENS = [  # of MulRan, HeLiPR and the KAIST urban data, whose tools name them so
+    "time",
+    *(f"orientation.{axis}" for axis in "xyzw"),
+    *(f"euler_{axis}" for axis in "xyz"),
+    *(f"angular_velocity.{axis}" for axis in "xyz"),
+    *(f"linear_acceleration.{axis}" for axis in "xyz"),
+    *(f"magnetic_field.{axis}" for axis in "xyz"),
+]
 MIN_ROWS, MIN_SHARE = 5, 0.3  # of the lines looked at that have the same words; status lines may stand between
 MIN_TENTH = 0.5  # of the median length, which 90 % of an accelerometer's readings exceed
 MIN_NUMBERS, MIN_LABELS = 4, 2  # in a row
@@ -167,6 +175,15 @@ def _is_core_motion(columns: Columns, numbered: list[str]) -> bool:
     return bool(np.nanmax(np.abs(np.stack(gravity) - expected)) < DIRECTION)
 
 
+def _is_xsens(columns: Columns, numbered: list[str]) -> bool:
+    """Whether unnamed columns are those of an Xsens sensor: its quaternion, and gravity where its accelerometer is alone."""
+    if len(numbered) != len(XSENS) or not rises(columns.values[numbered[0]]):
+        return False
+    lengths = np.linalg.norm([columns.values[name].astype(float) for name in numbered[1:5]], axis=0)
+    is_turn = bool(np.nanmax(np.abs(lengths - 1.0)) < DIRECTION)
+    return is_turn and _has_gravity(columns, numbered[11:14]) and not _has_gravity(columns, numbered[8:11])
+
+
 def _place_of_time(columns: Columns) -> int:
     """Place of the time in a table without a header: 1 behind a number of the row, else 0."""
     first, second = ([*columns.values.values()][:2] + [np.zeros(0)] * 2)[:2]
@@ -191,6 +208,8 @@ def name_headerless(columns: Columns) -> None:
         new, why = ROS_IMU, "it has the columns of `ros2 topic echo --csv` of sensor_msgs/Imu"
     elif [*columns.values] == numbered and _is_core_motion(columns, numbered):
         new, why = CORE_MOTION, "it has no header: its columns are those of CoreMotion, as in OxIOD"
+    elif [*columns.values] == numbered and _is_xsens(columns, numbered):
+        new, why = XSENS, "it has no header: its columns are those of an Xsens sensor, as in MulRan"
     elif [*columns.values] == numbered and (halves := _halves(columns, numbered[_place_of_time(columns) :])):
         count = len(numbered) - len(halves.time) - 6
         if count != _place_of_time(columns):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from imutool.recording.joined_imu import joined, steady_force, unit_by_gravity
 
 from ..text.delimited import Columns
 from ..text.names import spaced_name, split_name
-from .map import Proposal
+from .map import Proposal, TableMap
 from .pose_names import axes_of
 from .units import ACCEL_SI, GYRO_SI, STANDARD_GRAVITY, TIME_NS, gravity_units, is_motion_alone
 
@@ -26,6 +27,7 @@ CORE_MOTION = {  # names of `CMDeviceMotion` on iOS and watchOS, as several prog
     "gravity": r"(.*_)?(motion_?)?gravity_?(?P<axis>[xyz])",
     "acceleration": r"(.*_)?(motion_?)?((user_?)?acceleration|user_?acc)_?(?P<axis>[xyz])",
 }
+APPLE = r"(?i)(?<![a-z])(iphone|ipad|ios|apple_?watch|watchos)(?![a-z])"  # in the name of a file or its folder
 UNIT_BAND = 0.02  # of the length of a gravity in g
 
 
@@ -49,6 +51,15 @@ def add_gravity(columns: Columns) -> None:
             columns.values[f"user_{own}"] = columns.values.pop(own)
     note = f"{motion[0]}/y/z and {gravity[0]}/y/z are of CoreMotion, which takes gravity out and reads -1 g upwards"
     columns.remarks.notes.append(f"{note}: the specific force is minus their sum")
+
+
+def sign_doubts(path: Path, table: TableMap) -> list[str]:
+    """Doubt about the sign of an accelerometer in g, which a file or folder named after Apple holds as CoreMotion reads it."""
+    named = re.search(APPLE, path.name) or re.search(APPLE, path.resolve().parent.name)
+    if named is None or table.accel_unit != "g" or table.accel[0].startswith("-"):
+        return []
+    what = f"{named[0]!r} in its path may mean CoreMotion, which reads -1 g along the axis that points up"
+    return [f"{table.topic}: {what}: its sign stays, and --map accel={','.join(f'-{c}' for c in table.accel)} turns it"]
 
 
 def doubt_gravity(proposal: Proposal, columns: Columns) -> None:

@@ -35,6 +35,7 @@ MAX_NUMBERS = 9  # or words, in an array that belongs to one sample, as a matrix
 MAX_DAMAGED = 0.1  # share of the lines that a logger cut off or garbled
 MIN_SHARE = 0.05  # of the rows that have the same fields, if they are of a kind of their own
 FAR = 2**1000  # beyond which an integer is no float64
+SIGNAL = {"unit", "values"}  # of a signal, as A2D2 has the bus of a car
 Row = dict[str, Any]
 
 
@@ -50,7 +51,7 @@ def load_json(path: Path, columns: Columns) -> None:
         DataError: no JSON.
     """
     tables: dict[str, list[Row]] = {}
-    for name, node in _nodes(_decoded(path, columns), ""):
+    for name, node in _nodes(_without_signals(_decoded(path, columns), columns), ""):
         if isinstance(node, list) and isinstance(node[0], dict):
             for kind, rows in _kinds(node).items():
                 tables["/".join(filter(None, (name, kind)))] = rows
@@ -77,6 +78,26 @@ def load_json(path: Path, columns: Columns) -> None:
             group = sensors.get(name, name)
             name_columns(part, sensors.get(name, ""))
             columns.take(group, part, name)
+
+
+def _without_signals(document: Any, columns: Columns) -> Any:
+    """The document without signals that have times of their own; their columns are taken in.
+
+    Such is `{"ax": {"unit": "g", "values": [[0, 0.1], ...]}}`. Signals of the same times are a group.
+    """
+    named = document.items() if isinstance(document, dict) else ()
+    found = {
+        name: node for name, node in named if isinstance(node, dict) and node.keys() == SIGNAL and _is_matrix(node["values"])
+    }
+    groups: dict[bytes, Columns] = {}
+    for name, node in found.items():
+        times, values = (_numbers([row[place] for row in node["values"]]) for place in (0, 1))
+        group = groups.setdefault(times.tobytes(), Columns())
+        group.add("time", times)
+        group.add(name, values, node["unit"] or "")
+    for group in groups.values():
+        columns.take([*group.values][1], group, ", ".join([*group.values][1:]))
+    return {name: node for name, node in document.items() if name not in found} if found else document
 
 
 def _decoded(path: Path, columns: Columns) -> Any:

@@ -29,6 +29,7 @@ OTHERS = r"bias|biases|calib|calibration|linear|linea[lr]|user|gravity|noise|all
 UNCORRECTED = r"uncal|uncalib|uncalibrated|raw|ref|reference"  # taken where nothing else is there: not calibrated, or ideal
 WORD = r"[A-Z]?[a-z]+|[A-Z]+"
 POSE = ["time", *(f"position_{a}" for a in "xyz"), *(f"quaternion[{k}]" for k in range(4))]
+RIGID = ["time", *(name for row in range(3) for name in (*(f"rotation_{row}{k}" for k in range(3)), f"position_{'xyz'[row]}"))]
 SPACED = r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"  # UncalGyroXRadPerSec
 ANDROID, ANDROIDS = r"TYPE_[A-Z_]+", {"gyro": "rad/s", "accel": "m/s^2"}  # constants of Android, which states these units
 MAX_NAMES, MIN_ROWS = 60, 20
@@ -191,7 +192,7 @@ def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
     if has_header and not sensor:
         return
     if not sensor:
-        pose = POSE if len(names) == len(POSE) and _turns(table, names[-4:]) else POSE[:1]
+        pose = next((p for p, turns in HEADERLESS if len(names) == len(p) and turns(table, names)), POSE[:1])
         new = dict(zip(names, pose, strict=False)) if rises(table.values[names[0]]) else {}
     else:
         first = next((n for n, name in enumerate(names) if not _ascends(table.values[name])), len(names))
@@ -220,9 +221,19 @@ def _ascends(values: np.ndarray) -> bool:
 
 
 def _turns(table: Columns, names: list[str]) -> bool:
-    """Whether four columns are quaternions."""
-    size = np.linalg.norm([table.values[name].astype(float) for name in names], axis=0)
+    """Whether the last four columns are quaternions."""
+    size = np.linalg.norm([table.values[name].astype(float) for name in names[-4:]], axis=0)
     return bool(abs(np.median(size) - 1.0) < NEAR_ONE)
+
+
+def _is_rigid(table: Columns, names: list[str]) -> bool:
+    """Whether the columns behind the first are a rotation with a position, row by row."""
+    rows = table.side_by_side(names[1:]).reshape(-1, 3, 4)[:, :, :3]
+    off = np.abs(rows @ rows.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    return bool(np.median(off) < NEAR_ONE and np.median(np.linalg.det(rows)) > 0.0)
+
+
+HEADERLESS = (POSE, _turns), (RIGID, _is_rigid)  # names of the columns of a trajectory: TUM's, and that of MulRan
 
 
 def _words(name: str) -> list[str]:

@@ -19,16 +19,18 @@ OWN_TIME = {  # names of a sensor's own stamps begin so: gyro_time, acc_ts; or a
     "accel": rf"acc(el(eration|erometer)?)?_t|{BEHIND}acc(el(eration|erometer)?)?$",
 }
 SECOND, PER, SQUARED = r"s(ec(ond)?)?", r"(\^?-|⁻)", r"([ _]?(\^|\*\*)?2|²|[ _]?squared|/s(ec)?)"
+VECTOR = "unit_degreofarcpersecon", "unit_meterperseconsquar", "unit_forceofgravi"  # of cars' buses, in data bases of Vector
 SAME_MARKS = str.maketrans("μº", "µ°")  # a Greek letter, an ordinal
 UNITS = {
     "rad/s": rf"rps|radps|rad(ian)?s?[ _]?(per|/)[ _]?{SECOND}|rad[ .·*]?s{PER}(1|¹)|rad_?{SECOND}",
-    "deg/s": rf"dps|degps|(deg(ree)?s?|°)[ _]?(per|/)[ _]?{SECOND}|(deg|°)[ .·*]?s{PER}(1|¹)|deg_?{SECOND}",
+    "deg/s": rf"dps|degps|(deg(ree)?s?|°)[ _]?(per|/)[ _]?{SECOND}|(deg|°)[ .·*]?s{PER}(1|¹)|deg_?{SECOND}|{VECTOR[0]}",
     "mdeg/s": rf"mdps|mdegs|m(deg|°) ?/ ?{SECOND}",
-    "m/s^2": rf"m/\({SECOND}\^?2\)|mps2|ms2|mss|m[ .·*]?s{PER}(2|²)|(m|met(er|re)s?)(_|[ _]?(per|/)[ _]?){SECOND}{SQUARED}",
+    "m/s^2": rf"m/\({SECOND}\^?2\)|mps2|ms2|mss|m[ .·*]?s{PER}(2|²)"
+    rf"|(m|met(er|re)s?)(_|[ _]?(per|/)[ _]?){SECOND}{SQUARED}|{VECTOR[1]}",
     "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²|gals?",
     "ft/s^2": r"(ft|feet|foot)/s(ec)?((\^|\*\*)?2|²|/s(ec)?)|(ft|feet|foot)[ .·]?s\^?-2|fps\^?2|ft_?(per_?)?s_?2",
     "mg": r"mg|milli[ _-]?gs?",
-    "g": r"g'?s?|g[ _-]?forces?",
+    "g": rf"g'?s?|g[ _-]?forces?|{VECTOR[2]}",
     "ns": r"ns|(n|nano)sec(ond)?s?|nanos",
     "us": r"us|µs|(u|micro)sec(ond)?s?|micros",
     "ms": r"ms|(m|milli)sec(ond)?s?|millis",
@@ -72,7 +74,7 @@ WORDS = {
     rf"|specific_?force|sp_?force|(linear)?beschleunigung|{UNBIASED}a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
 }
 STATES = (  # of the numbers in a column
-    r"_(sensor|raw|deg(rees?)?|rad(ians?)?|adc|counts?|(un)?cal(ib)?(rated)?|data|values?|readings?|meas(ured)?)"
+    r"_(sensor|raw|deg(rees?)?|rad(ians?)?|adc|counts?|(un)?cal(ib)?(rated)?|data|values?|readings?|meas(ured)?|(non_?)?wake_?up)"
 )
 STATE = rf"(?P<state>({STATES})?)"
 PLACES = (  # of several IMUs on a body
