@@ -7,6 +7,7 @@ import functools
 import graphlib
 import re
 import statistics
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -102,6 +103,16 @@ SOURCES = [*sorted((ROOT / "imutool").rglob("*.py")), *sorted((ROOT / "converter
 
 def test_every_room_has_its_place_in_the_order() -> None:
     assert {room(name) for name in package()} - {""} <= set(LEVEL)
+
+
+def test_the_architecture_shows_the_same_order() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    table = text.partition("| floor | room |")[2].partition("\n\n")[0].splitlines()[2:]
+    floors: list[set[str]] = []
+    for _, floor, named, *_ in (line.split("|") for line in table):
+        floors += [set()] if floor.strip() else []
+        floors[-1] |= set(re.findall(r"`imutool/(\w+)(?:/|\.py)`", named))
+    assert floors == [set(rooms) - {"__main__"} for rooms in TIERS]
 
 
 def test_lower_rooms_never_import_higher_ones() -> None:
@@ -267,6 +278,30 @@ def test_no_private_name_is_imported_from_another_room() -> None:
     assert found == []
 
 
+OF_NAMED_TUPLES = {"_asdict", "_fields", "_make", "_replace"}
+
+
+def private_attributes(tree: ast.Module) -> Iterator[str]:
+    """Private attributes that a module reads of others than itself, its parents and `os`, and does not define."""
+    own = {node.name for node in nodes(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    own |= {node.attr for node in nodes(tree) if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)}
+    own |= {node.id for node in nodes(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+    for node in nodes(tree):
+        if (
+            isinstance(node, ast.Attribute)
+            and is_private(node.attr)
+            and node.attr not in own | OF_NAMED_TUPLES
+            and ast.unparse(node.value) not in {"self", "cls", "super()", "os"}
+        ):
+            yield ast.unparse(node)
+
+
+def test_no_private_attribute_is_read_from_another_module() -> None:
+    assert {name: read for name, tree in everything().items() if (read := [*private_attributes(tree)])} == {}
+    wrong = ast.parse("def f(log):\n    self._own = log._replace(a=1)\n    return self.log._source, log._own, self._parents")
+    assert [*private_attributes(wrong)] == ["self.log._source"]
+
+
 def test_a_module_says_in_one_line_what_it_holds() -> None:
     first = {name: (ast.get_docstring(tree) or "").partition("\n")[0] for name, tree in everything().items()}
     assert {name: line for name, line in first.items() if not 0 < len(line) <= FIRST_LINE} == {}
@@ -368,14 +403,29 @@ def test_constraints_are_exact_and_hold_no_local_version() -> None:
     assert not found.keys() & {"imutool", "ahrs"}
 
 
-def test_constraints_hold_all_we_depend_on() -> None:
+def dependencies() -> set[str]:
+    """Names of the packages in pyproject.toml, those of all extras included."""
     import tomllib
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     wanted = [*project["dependencies"], *(line for name in extras for line in extras[name])]
-    names = {re.split(r"[<>=!~\[;]", line)[0].strip() for line in wanted}
-    assert names - {"imutool"} <= dict(pins()).keys()
+    return {re.split(r"[<>=!~\[;]", line)[0].strip() for line in wanted} - {"imutool"}
+
+
+def test_constraints_hold_all_we_depend_on() -> None:
+    assert dependencies() <= dict(pins()).keys()
+
+
+def test_what_is_imported_is_a_dependency_of_ours_and_not_of_another_package() -> None:
+    from importlib.metadata import packages_distributions
+
+    imported = {other.partition(".")[0] for tree in everything().values() for other in imports(tree, set())}
+    known = {
+        module: {re.sub(r"[-_.]+", "-", name).lower() for name in names} for module, names in packages_distributions().items()
+    }
+    others = imported - set(sys.stdlib_module_names) - {"imutool"}
+    assert {module for module in others if not known.get(module, set()) & dependencies()} == set()
 
 
 def test_a_list_of_arrays_names_no_length() -> None:
