@@ -29,7 +29,7 @@ def train(
     model: Annotated[str, typer.Option("-o", "--output", metavar="MODEL.safetensors", help="File of the new model."), MODEL],
     method: Annotated[str, typer.Option(help="Bias model from the list below.")] = "hybrid",
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="Settings; the documentation lists them (Reference, Settings).")
+        Path | None, typer.Option(metavar="FILE.toml", help="File of settings; the documentation lists them.")
     ] = None,
     set_: Set = None,
     physics: Annotated[
