@@ -466,7 +466,7 @@ def test_a_model_for_another_rate_is_refused(source: Path, tmp_path: Path) -> No
     assert not (tmp_path / "out.mcap").exists()
     fit = debias(source, tmp_path / "out.mcap", model=path, force=True).fits["/imu0"]
     assert fit.verdict == "doubtful"
-    assert "samples at 200.00 Hz, in the training runs at 100.00 Hz" in fit.reasons
+    assert "samples at 200.00 Hz, in the training logs at 100.00 Hz" in fit.reasons
     save(make_model("linear", 200.0), tmp_path / "fast.safetensors")
     debias(source, tmp_path / "same.mcap", model=tmp_path / "fast.safetensors", force=True)
     forced, same = (read(tmp_path / name, imu="/imu0/debiased").imu for name in ("out.mcap", "same.mcap"))

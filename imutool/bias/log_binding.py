@@ -48,7 +48,7 @@ def at_rate(model: BiasModel, rate_hz: float, where: object, t_ns: Stamps | None
     possible = not (batches or model.counts_samples) and 1 / MAX_FACTOR < rate_hz / model.rate_hz < MAX_FACTOR
     if possible and force:
         out = model.at(rate_hz)
-        out.remarks = (*model.remarks, f"samples at {rate_hz:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
+        out.remarks = (*model.remarks, f"samples at {rate_hz:.2f} Hz, in the training logs at {model.rate_hz:.2f} Hz")
         return out
     what = f"IMU at {rate_hz:.1f} Hz{f' by most of its steps, and {mean_hz:.1f} Hz in the mean' if batches else ''}"
     expected = f"{model.rate_hz:.1f} Hz, at which model {model.card.get('name', model.method)!r} was trained"
@@ -68,9 +68,9 @@ def other_conditions(model: BiasModel, samples: tuple[Float64[np.ndarray, " n"],
     known = model.noise_std > 0
     ratio = float((noise[known] / model.noise_std[known]).max()) if known.any() else 0.0
     if ratio > MAX_NOISE:  # less noise is no doubt: a drone in the hand has a tenth of that in flight
-        sentences.append(f"the samples are {ratio:.0f} times as noisy as in the training runs: another sensor, or vibration")
+        sentences.append(f"the samples are {ratio:.0f} times as noisy as in the training logs: another sensor, or vibration")
     if model.rate_hz and not (1.0 - MAX_RATE) / longest < model.rate_hz < (1.0 + MAX_RATE) / shortest:
-        sentences.append(f"samples at {1.0 / period_s:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
+        sentences.append(f"samples at {1.0 / period_s:.2f} Hz, in the training logs at {model.rate_hz:.2f} Hz")
     return sentences
 
 

@@ -94,7 +94,7 @@ class LogDrift(Protocol):
 
 
 class BiasModel(ABC):
-    """Bias model with the statistics of its sensor's training runs, from which every run starts.
+    """Bias model with the statistics of its sensor's training logs, from which every run starts.
 
     It computes in float64; files store float32. `tensors` are the weights and statistics by name, with the shapes of `shapes`;
     missing ones are zero. `log_drift` is the drift in the log that the model is bound to; its streams take samples without
@@ -135,7 +135,7 @@ class BiasModel(ABC):
 
     @property
     def prior_mean(self) -> Vector6:
-        """Mean of the rest bias over the training runs."""
+        """Mean of the rest bias over the training logs."""
         return self.tensors["prior_mean"]
 
     @property

@@ -14,7 +14,7 @@ from imutool.bias.model import BiasModel, CovarianceModel, Stream, Vector6
 from imutool.config import Settings
 from imutool.units import Sensor
 
-# Without training runs a measurement outweighs the prior: spreads of a consumer sensor (Bosch BMI160 data sheet: zero-rate
+# Without training logs a measurement outweighs the prior: spreads of a consumer sensor (Bosch BMI160 data sheet: zero-rate
 # offset 3 deg/s, zero-g offset 40 mg).
 UNTRAINED: Mapping[str, np.ndarray] = {
     "prior_std": np.array([0.05] * 3 + [0.4] * 3, np.float32),  # single precision, as in a file

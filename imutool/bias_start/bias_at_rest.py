@@ -48,7 +48,7 @@ PIECE = 512  # samples, of which the search for a stop takes no more than it nee
 
 
 def auto(model: BiasModel, imu: Imu) -> InitialBias:
-    """Bias from the first stop of the first minute and the training runs, then tracked.
+    """Bias from the first stop of the first minute and the training logs, then tracked.
 
     Samples up to the end of that stop get the bias that all of them show, smoothed where it moves. Later ones get that of the
     samples before them.

@@ -97,7 +97,7 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     rest, std = _updated(start, offset, variance)
     late = f", of poses {1e3 * abs(late_s):.0f} ms {'late' if late_s > 0 else 'early'}" if late_s else ""
     doubt = ", whose thirds contradict each other" if (variance > usual)[:3].any() else ""
-    weighed = ", weighed against the training runs" if model.card else ""
+    weighed = ", weighed against the training logs" if model.card else ""
     how = f"truth over {length_s:.1f} s{late}{doubt}{weighed}, {accuracy(std)}"
     if not model.card:
         return InitialBias(rest, std, how)

@@ -3,7 +3,7 @@
 The inertial filter predicts the samples of each half second: at rest no velocity and no rate, in motion a bounded velocity,
 which ties the gyro to gravity. Under a model that fits, the innovations e of the bounded velocity are small, e^T S^-1 e ~
 chi-square with three degrees of freedom (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
-Navigation, 2001, sec. 5.4), and the bias that the log shows lies within the prior of the training runs. The innovations of the
+Navigation, 2001, sec. 5.4), and the bias that the log shows lies within the prior of the training logs. The innovations of the
 raw samples ask for the whole of the model's correction in motion (`imutool.inertial.innovations`), whatever bias a new
 switching-on gave; a log that asks for less than half is another unit's. A lever arm is no such correction.
 Where one of the three fails, the likelihood of the innovations is compared with that of the raw samples and an unknown constant

@@ -1,6 +1,6 @@
 """Initial bias of a run: the rest bias at its start, with standard deviation and source.
 
-A measurement (at rest: `bias_at_rest`; from true poses: `bias_from_truth`) and the prior of the training runs are combined by
+A measurement (at rest: `bias_at_rest`; from true poses: `bias_from_truth`) and the prior of the training logs are combined by
 their variances, axis by axis; a measurement along one direction is a Kalman update. The prior is about the mean of the training
 session within hours of the log, else of all sessions. The log decides on its width (`supported_std`, `widened`). A model may
 add a motion-dependent part C(u): the measurement then uses the samples without that part.
@@ -49,7 +49,7 @@ AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravi
 MIN_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # with a prior of zero variance nothing could be estimated
 SESSION_GAP_S = 6 * 3600.0  # a longer pause is another switching-on
 NOT_SWITCHED = 0.5  # probability that a sensor stayed on within these hours
-PRIOR, TRACKED_BY = "prior of the training runs", "gravity in motion and every stop"
+PRIOR, TRACKED_BY = "prior of the training logs", "gravity in motion and every stop"
 UNKNOWN_BODY = {"speed_m_s": 10.0, "speed_correlation_s": 0.5}  # with 3 m/s cars had twice the error, drones a twelfth less
 STEP_S = 1.0  # of the covariance of a constant rest bias, whose dynamics take minutes
 
@@ -175,7 +175,7 @@ def prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
 
 
 def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
-    """Prior of the bias filter from the training runs; a sensor's axes share one random walk."""
+    """Prior of the bias filter from the training logs; a sensor's axes share one random walk."""
     start = prior(model, first_ns)
     ground = np.maximum(model.rest_std, AT_REST_STD)
     walk = np.repeat(np.sqrt(np.mean(model.walk_std.reshape(2, 3) ** 2, axis=1)), 3)
@@ -195,7 +195,7 @@ def tracked_from_prior(model: BiasModel, first_ns: int | None = None) -> Initial
 
 
 def smoothed_start(model: BiasModel, batches: Iterable[Samples], before: BiasPrior, where: str = "") -> InitialBias:
-    """Smoothed rest bias in time, by all stops, gravity in motion and the training runs.
+    """Smoothed rest bias in time, by all stops, gravity in motion and the training logs.
 
     `batches` are seconds since the first sample, gyro and accel; they are iterated again if the log contradicts the prior.
 
@@ -234,7 +234,7 @@ def training_source(model: BiasModel) -> str:
     if not model.card or "prior" in model.card:  # a model that was not trained names the source of its bias
         return str(model.card.get("prior", "zero, as an untrained model has no prior"))
     logs = model.card.get("logs", ())
-    return f"prior of {len(logs)} runs" if isinstance(logs, list | tuple) and len(logs) > 1 else PRIOR
+    return f"prior of {len(logs)} logs" if isinstance(logs, list | tuple) and len(logs) > 1 else PRIOR
 
 
 def accuracy(std: Vector6) -> str:

@@ -122,7 +122,7 @@ def max_left(sessions: int) -> float:
 
 
 def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, max_left: float, *, confirmed: bool = False) -> list[str]:
-    """Sentence on a log whose bias is clearly that of the training runs in turned axes.
+    """Sentence on a log whose bias is clearly that of the training logs in turned axes.
 
     A correction of scales is the same in axes that are turned by half a turn, so the share of it says nothing about these. If
     it is `confirmed`, there are no other turns. `max_left` is the share of chi-square that turned axes leave at most: less,
@@ -176,7 +176,7 @@ def untold_bias(mean: Vector6, std: Vector6) -> str:
     large = size > MAX_CHANGE
     axis = int(np.argmax(np.where(large, size, 0.0)[:3]))
     if large[axis] and not (large & (std < size / MAX_DEVIATIONS)).any():
-        bias = f"the gyro's bias about {'xyz'[axis]}, {mean[axis]:+.2g} rad/s in the training runs"
+        bias = f"the gyro's bias about {'xyz'[axis]}, {mean[axis]:+.2g} rad/s in the training logs"
         return f"the log neither shows {bias}, nor names its sensor: on another one, it does harm"
     nothing = "the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor"
     return "" if (std < TELLING / 2.0).any() else nothing

@@ -30,7 +30,7 @@ def clean(
     rule: Annotated[list[str] | None, typer.Option("--rule", metavar="NAME", help="Run only this rule. Repeatable.")] = None,
     no_rule: Annotated[list[str] | None, typer.Option("--no-rule", metavar="NAME", help="Skip this rule. Repeatable.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Write OUT even if the log cannot be trusted.")] = False,
-    fix: Annotated[bool, typer.Option("--fix", help="In OUT, correct axes that the motion shows to be wrong.")] = False,
+    fix: Annotated[bool, typer.Option("--fix", help="In OUT, correct axes that the motion contradicts.")] = False,
     report_to: Annotated[
         Path | None, typer.Option("--report", metavar="F.html", help="Write the findings as an HTML page."), HTML
     ] = None,

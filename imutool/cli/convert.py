@@ -45,9 +45,9 @@ def convert(
             "--map", metavar="F.toml|KEY=VALUE", help="Meaning and units of a table's columns, as gyro_unit=deg/s. Repeatable."
         ),
     ] = None,
-    fix: Annotated[bool, typer.Option("--fix", help="Correct units, axes and frames shown wrong by the motion.")] = False,
+    fix: Annotated[bool, typer.Option("--fix", help="Correct units, axes and frames that the motion contradicts.")] = False,
     restamp: Annotated[bool, typer.Option("--restamp", help="Put late stamps on the clock of the IMU.")] = False,
-    workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per processor.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per core.")] = None,
     common: Common = COMMON,
 ) -> None:
     """Convert any recording with an IMU to MCAP; the format is recognised."""
@@ -115,7 +115,7 @@ def _grouped(sentences: list[str]) -> list[str]:
 @app.command(epilog="Example: [bold]imutool export MH_04_debiased.mcap MH_04_debiased --format euroc[/]")
 def export(
     log: Annotated[
-        Path, typer.Argument(metavar="LOG", help="An MCAP log; for a simulator a diagnosis' folder, or a folder of several.")
+        Path, typer.Argument(metavar="LOG", help="An MCAP log; for a simulator, the folder of a diagnosis, or one of several.")
     ],
     target: Annotated[Path, typer.Argument(metavar="OUT", help="New folder."), FOLDER],
     format: Annotated[

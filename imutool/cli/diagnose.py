@@ -27,7 +27,7 @@ Folder = Annotated[
 ]
 Sim = Annotated[
     str | None,
-    typer.Option(metavar="SIM", help="Simulation, of any motion if both have poses; by default along the recording's poses."),
+    typer.Option(metavar="SIM", help="Simulation; by default the recording's poses. With poses in both, motions may differ."),
 ]
 Close = Annotated[
     bool,
@@ -53,7 +53,7 @@ def diagnose(
     metric: Metric = None,
     config: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.toml", help="Settings; the documentation lists them (Reference, Settings)."),
+        typer.Option(metavar="FILE.toml", help="File of settings; the documentation lists them."),
     ] = None,
     set_: Set = None,
     imu: Imu = None,
@@ -133,8 +133,8 @@ def audit(
 ) -> None:
     """Find the errors of a simulator's IMU, without a recording.
 
-    Gravity, frame, axes, transport term, point, timing, noise, digits and limits, each with its equation and the report of a
-    simulator that had it.
+    It checks gravity, frame, axes, transport term, lever arm, timing, noise, digits and limits. Each error comes with its
+    equation and a report of a simulator that had it.
     """
     from imutool.diagnosis.audit import audit as run
     from imutool.diagnosis.audit import lines

@@ -92,8 +92,8 @@ def evaluate(
 ) -> None:
     """Integrate the IMU from the true start, raw and debiased, and compare it with the truth.
 
-    Without --model the debiased samples of the log are scored, if it has them. A model that does not apply to a log or does
-    not fit it, and a log of several that is not usable, are named at the end, after the scores of the others.
+    Without --model it scores the debiased samples of the log, if there are any. Models that do not apply to a log or do not
+    fit it, and logs that are not usable, are named after the scores of the others.
     """
     from imutool.evaluation import evaluate as run
 

@@ -155,7 +155,7 @@ def info() -> Settings:
 @_command("diagnose logs/ diagnosis/ --robot-from '^([^/]+)/' --report robots.html")
 def diagnose(
     sim: Annotated[
-        str | None, typer.Option(metavar="DIR", help="Simulations under the logs' names; by default the true poses.")
+        str | None, typer.Option(metavar="DIR", help="Folder of simulations with the logs' names; by default the true poses.")
     ] = None,
     robot_from: Annotated[
         str | None,

@@ -46,7 +46,7 @@ def info(
 ) -> None:
     """Report the topics, quality and damage of a log; with --noise, also its IMU noise.
 
-    Of several logs, one that cannot be read is named at the end, after the reports of the others.
+    Logs that cannot be read are named after the reports of the others.
     """
     from imutool.log_info.report import LogInfos
 

@@ -43,7 +43,7 @@ def live(
     source: Annotated[str | None, typer.Option("--from", metavar="SOURCE", help=FROM_HELP, show_default=False)] = None,
     model: Annotated[str, typer.Option(help=MODEL_HELP)] = "static",
     imu: Imu = None,
-    speed: Annotated[float, typer.Option(min=0.01, help="Speed of a log, times its own.")] = 1.0,
+    speed: Annotated[float, typer.Option(min=0.01, help="Speed of a log, as a multiple of its own.")] = 1.0,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="End after this time; else at the end or at Ctrl-C.")] = None,
     connect: Annotated[str | None, typer.Option(metavar="URL", help="Show in a running viewer: HOST:PORT.")] = None,
     save: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save what is shown to a file."), RRD] = None,

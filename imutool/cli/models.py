@@ -30,7 +30,7 @@ class Models(Report, frozen=True, tag="imutool.models/1"):
 
 @app.command(epilog="Example: [bold]imutool models --json -[/]")
 def models(common: Common = COMMON) -> None:
-    """List the models that come with imutool: method, sensor, data set and rate."""
+    """List the models that ship: method, sensor, data set and rate."""
     from imutool.bias.model_file import header_of, library
 
     entries = []

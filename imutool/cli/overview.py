@@ -27,7 +27,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {  # by name: the module, and the firs
     "diagnose": ("diagnose", "Find physics that a simulation leaves out, by comparison with a recording."),
     "audit": ("diagnose", "Find the errors of a simulator's IMU, without a recording."),
     "conceal": ("simulate", "Make a sealed blind case, or open one and score the findings."),
-    "models": ("models", "List the models that come with imutool: method, sensor, data set and rate."),
+    "models": ("models", "List the models that ship: method, sensor, data set and rate."),
     "schema": ("models", "Print the JSON Schema of a report, or list the reports."),
     "new-converter": ("convert", "Write a template of a converter, with a test, as a package of its own."),
     "demo": ("demo", "Run a demo without download: convert, train, debias, evaluate, view."),

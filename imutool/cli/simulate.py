@@ -66,7 +66,7 @@ def simulate(
 ) -> None:
     """Simulate an IMU, with a sensor's physics and noise.
 
-    It moves along the poses of a log, or as the samples of a simulated IMU say.
+    The motion is that of the log's poses or, with --imu, of a simulated IMU's samples.
     """
     from imutool.file_location import local
     from imutool.sensor.simulate import simulate as run

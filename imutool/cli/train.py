@@ -29,7 +29,7 @@ def train(
     model: Annotated[str, typer.Option("-o", "--output", metavar="MODEL.safetensors", help="File of the new model."), MODEL],
     method: Annotated[str, typer.Option(help="Bias model from the list below.")] = "hybrid",
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="Settings; the documentation lists them (Reference, Settings).")
+        Path | None, typer.Option(metavar="FILE.toml", help="File of settings; the documentation lists them.")
     ] = None,
     set_: Set = None,
     physics: Annotated[
@@ -115,8 +115,8 @@ def left_out_table(left_out: Mapping[str, Any]) -> None:
     ]
     parts = left_out["parts"]
     table([("left-out part" if parts else "left-out log", "error °", *models), *cells], keys=2)
-    why = "by how they predict each part from the others" if parts else "the simplest that is not beaten"
-    say(", ".join(f"{sensor}: {kept}" for sensor, kept in left_out["kept"].items()) + f" kept, {why}")
+    why = "by how they predict each part from the others" if parts else "the simplest models that are not beaten"
+    say(f"kept {', '.join(f'{kept} for the {sensor}' for sensor, kept in left_out['kept'].items())}: {why}")
 
 
 def lines_of_choice(card: Mapping[str, Any]) -> list[str]:

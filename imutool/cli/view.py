@@ -64,8 +64,8 @@ def view(
 ) -> None:
     """Show truth, raw and debiased: in the Rerun viewer, in a browser, or as files.
 
-    Without one of --save, --connect, --web, --export-web, --png and --html a viewer opens; where it cannot, an .rrd is
-    saved. Of several logs, one that is not usable is named at the end.
+    Without --save, --connect, --web, --export-web, --png and --html, a viewer opens; without a display, an .rrd is saved.
+    Logs that are not usable are named at the end.
     """
     from imutool.viewing.model.load_view import load
     from imutool.viewing.model.trajectory_error import alignment

@@ -3,7 +3,7 @@
 MODEL is of the same sensor and trained on other logs than these, as those of `python examples/reproduce_tables.py DATA -o OUT
 --swap` are for the training sequences. Prints the AOE in degrees of pure integration from the true pose:
 
-    truth     `--init truth`: its first seconds, then followed                prior    mean of the training runs
+    truth     `--init truth`: its first seconds, then followed                prior    mean of the training logs
     rest      first stop, else the prior (the rule before there was a filter) VQF      its bias estimate, causal
     VQF all   its offline estimate                                            auto     `--init auto`
     smooth    `--smooth`                                                      oracle   each log's own constant, by truth

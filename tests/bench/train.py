@@ -277,7 +277,7 @@ def main() -> None:
     parser.add_argument("--released", type=Path, metavar="DIR", help="the paper's released code")
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--segments", type=int, default=1000)
-    parser.add_argument("--seconds", type=float, default=120.0, help="length of the flight (EuRoC's training runs: 84 to 182)")
+    parser.add_argument("--seconds", type=float, default=120.0, help="length of the flight (EuRoC's training logs: 84 to 182)")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()

@@ -419,7 +419,7 @@ def test_a_model_that_counts_in_seconds_goes_at_another_rate_by_force(
         return
     found = at_rate(model, rate_hz, "log.mcap", force=True)
     assert (found.rate_hz, model.rate_hz) == (rate_hz, RATE_HZ)
-    assert found.remarks == (f"samples at {rate_hz:.2f} Hz, in the training runs at 200.00 Hz",)
+    assert found.remarks == (f"samples at {rate_hz:.2f} Hz, in the training logs at 200.00 Hz",)
     slow = type(network)(network.config, rate_hz).double()  # the same weights, made for that rate
     slow.load_state_dict(network.state_dict())
     seen = segment(5, 1, 200)

@@ -161,4 +161,4 @@ def test_a_network_without_a_rate_is_refused(name: str, tmp_path: Path) -> None:
 def test_logs_of_a_card_that_are_no_list_are_not_counted(saved: Path, logs: object) -> None:
     model = load(saved)
     model.card = {**model.card, "logs": logs}
-    assert training_source(model) == "prior of the training runs"
+    assert training_source(model) == "prior of the training logs"

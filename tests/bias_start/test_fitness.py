@@ -105,7 +105,7 @@ def test_another_switching_on_is_doubtful_not_unfit(model: BiasModel, recording:
     found = judged(model, shifted, MADE_FOR)
     assert found.verdict == "doubtful"
     assert "about y differs by" in found.reasons[0]
-    assert "from the model's prior" in found.reasons[0]  # a physics.toml has one without training runs
+    assert "from the model's prior" in found.reasons[0]  # a physics.toml has one without training logs
 
 
 @pytest.fixture(scope="module")
@@ -293,7 +293,7 @@ def test_another_rate_is_a_doubt_where_the_steps_show_it(
     found = judged(
         model, Imu(imu.t_ns + (slower * period_ns * np.arange(len(imu)) + late_ns).astype(np.int64), imu.gyro, imu.accel)
     )
-    assert ("Hz, in the training runs at" in " ".join(found.reasons)) == is_doubt, found
+    assert ("Hz, in the training logs at" in " ".join(found.reasons)) == is_doubt, found
 
 
 def test_steps_of_two_lengths_are_no_doubt_of_the_rate(model: BiasModel, recording: Recording) -> None:
@@ -302,7 +302,7 @@ def test_steps_of_two_lengths_are_no_doubt_of_the_rate(model: BiasModel, recordi
     longer = np.random.default_rng(6).permutation(len(imu)) < 0.502 * len(imu)
     t_ns = imu.t_ns[0] + np.cumsum(np.where(longer, 1.02, 0.98) * period_ns).astype(np.int64)
     found = judged(model, Imu(t_ns, imu.gyro, imu.accel))
-    assert "Hz, in the training runs at" not in " ".join(found.reasons), found
+    assert "Hz, in the training logs at" not in " ".join(found.reasons), found
 
 
 def test_an_unfit_model_is_refused_unless_forced_and_a_doubtful_one_is_used(
@@ -373,5 +373,5 @@ def test_a_sensor_without_bias_is_not_taken_for_one_with_a_large_bias(stops: boo
     found = judged(other, imu)
     told = " ".join(found.reasons)
     assert found.verdict == ("unfit" if stops else "doubtful"), told
-    assert ("the log neither shows the gyro's bias about z, +0.08 rad/s in the training runs" in told) == (not stops), told
+    assert ("the log neither shows the gyro's bias about z, +0.08 rad/s in the training logs" in told) == (not stops), told
     assert judged(other, imu, {"sequence": "own"}).verdict == ("unfit" if stops else "fits")

@@ -463,7 +463,7 @@ def test_auto_is_the_stop_the_log_begins_with_and_says_how_sure() -> None:
     imu, _ = resting()
     start = auto(trained(prior_std=0.05), imu)
     np.testing.assert_allclose(start.rest[:3], GYRO_BIAS, atol=5e-4)
-    found = "4.0 s at rest from 0.0 s on, prior of 6 runs, ±0.0002 rad/s (0.61° a minute)"
+    found = "4.0 s at rest from 0.0 s on, prior of 6 logs, ±0.0002 rad/s (0.61° a minute)"
     assert start.how == f"{found}, then gravity in motion and every stop"
     assert (start.hold_s, start.follows, start.track) == (pytest.approx(4.0, abs=0.01), start.follows, None)
     assert start.follows is not None
@@ -501,7 +501,7 @@ def test_the_whole_log_is_surer_than_its_start_and_later_stops_count() -> None:
     start = smoothed_start(made, [samples(imu)], bias_prior(made))
     assert start.track is not None
     assert start.how.startswith(("5.", "6."))
-    assert "s at rest in all, gravity in motion, prior of 6 runs, ±0.000" in start.how
+    assert "s at rest in all, gravity in motion, prior of 6 logs, ±0.000" in start.how
     np.testing.assert_allclose(start.track.at(np.array([11.0, 14.0]))[:, :3], np.tile(GYRO_BIAS, (2, 1)), atol=1.5e-3)
     assert (start.std[:3] < 0.2 * prior(made).std[:3]).all()
 
@@ -621,7 +621,7 @@ def test_a_model_that_says_how_rest_differs_is_believed() -> None:
 
 def test_the_prior_is_what_the_training_runs_had() -> None:
     start = prior(model(mean=0.3, prior_std=0.2))
-    assert (start.rest.tolist(), start.how) == ([pytest.approx(0.3)] * 6, "prior of the training runs")
+    assert (start.rest.tolist(), start.how) == ([pytest.approx(0.3)] * 6, "prior of the training logs")
     np.testing.assert_allclose(start.std, 0.2)
 
 
@@ -651,16 +651,16 @@ def test_each_word_finds_its_way(biased: Recording) -> None:
     moving = Recording("moving", resting([])[0])
     how = {way: find_initial_bias(way, trained, still).how for way in ("auto", "stationary", "prior", "1,2,3,4,5,6")}
     assert "at rest" in how["auto"]
-    assert how["auto"].startswith("4.0 s at rest from 0.0 s on, prior of the training runs, ±")
+    assert how["auto"].startswith("4.0 s at rest from 0.0 s on, prior of the training logs, ±")
     assert how["1,2,3,4,5,6"] == "given"
-    assert find_initial_bias("truth", trained, biased).how.startswith("truth over 12.0 s, weighed against the training runs, ±")
+    assert find_initial_bias("truth", trained, biased).how.startswith("truth over 12.0 s, weighed against the training logs, ±")
     assert find_initial_bias("auto", trained, moving).how.startswith(
-        "prior of the training runs, ±0.05 rad/s (170° a minute), then gravity in motion"
+        "prior of the training logs, ±0.05 rad/s (170° a minute), then gravity in motion"
     )
     with pytest.raises(DataError, match="does not start at rest"):
         find_initial_bias("stationary", trained, moving)
     with pytest.raises(DataError, match="does not start at rest"):
-        find_initial_bias("auto", static.Model(), moving)  # no training runs, no prior to fall back on
+        find_initial_bias("auto", static.Model(), moving)  # no training logs, no prior to fall back on
     assert find_initial_bias("prior", static.Model(), moving).how == "zero, as an untrained model has no prior"
 
 

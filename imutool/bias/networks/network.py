@@ -44,7 +44,7 @@ class LastLayer(NamedTuple):
 
 
 class BiasNetwork(nn.Module, ABC):
-    """Bias network with the statistics of its sensor's training runs, for training.
+    """Bias network with the statistics of its sensor's training logs, for training.
 
     It computes in float64 (`imutool.training.fit`), unless `see` says otherwise. Names and shapes of its state are those of
     the model.
