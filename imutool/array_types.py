@@ -9,6 +9,8 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 if TYPE_CHECKING or "jaxtyping" in sys.modules:
     from jaxtyping import (
         Bool,
@@ -36,6 +38,9 @@ else:
     ArrayLike = Any
     Bool = Complex128 = Float = Float64 = Int = Int64 = Num = UInt8 = UInt16 = UInt32 = UInt64 = Shaped
 
+Vectors = Float64[np.ndarray, "n 3"]  # of three axes, a row a sample
+Rows6 = Float64[np.ndarray, "n 6"]  # of the gyro, then of the accelerometer
+
 __all__ = [
     "ArrayLike",
     "Bool",
@@ -45,6 +50,7 @@ __all__ = [
     "Int",
     "Int64",
     "Num",
+    "Rows6",
     "Shaped",
     "UInt8",
     "UInt16",

@@ -24,7 +24,7 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 import msgspec
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6, Vectors
 from imutool.bias.model import COLUMNS, Array, BiasModel, Shapes, Stream, Vector6, matrices
 from imutool.bias.neural_stream import gelu
 from imutool.config import Settings
@@ -132,11 +132,9 @@ class _Stream:
         self.layers = {sensor: [_Convolution(layer) for layer in model.folded(sensor)] for sensor in SENSORS}
         self.out = {sensor: model.config.unit(sensor) * tensors[f"net.{sensor}.out"].T for sensor in SENSORS}
 
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 6"]:
+    def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Rows6:
         u = np.concatenate([gyro, accel], axis=1)
-        bias: Float64[np.ndarray, "n 6"] = np.empty_like(u)
+        bias: Rows6 = np.empty_like(u)
         for start in range(0, len(u), BLOCK):
             rows = slice(start, start + BLOCK)
             for sensor in SENSORS:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6, Vectors
 from imutool.bias.model import COLUMNS, DriftStream, Stream, Vector6
 from imutool.sensor.linear_form import CompiledEffects
 from imutool.sensor.signals import Load, SignalFilter
@@ -43,9 +43,7 @@ class EffectsStream:
         if isinstance(before, EffectsStream):
             self._signals.continue_load(before._signals)
 
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 6"]:
+    def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Rows6:
         """Bias at each sample."""
         if len(t_s) == 1:
             return self.one(float(t_s[0]), np.concatenate([gyro[0], accel[0]]))[None]
@@ -54,7 +52,7 @@ class EffectsStream:
         if math.isnan(self._start_s):
             self._start_s = float(t_s[0])
         signals = self._signals(t_s - self._start_s, gyro, accel)
-        error: Float64[np.ndarray, "n 6"] = np.dot(signals.columns, self._matrix)
+        error: Rows6 = np.dot(signals.columns, self._matrix)
         for columns, effects in ((COLUMNS["gyro"], self._gyro), (COLUMNS["accel"], self._accel)):
             for other in effects.others:
                 error[:, columns] += other(signals)

@@ -18,7 +18,7 @@ from typing import ClassVar, Self
 import msgspec
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Float64, Int64, Vectors
 from imutool.bias import neural_ode
 from imutool.bias.effects_stream import EffectsStream
 from imutool.bias.model import Array, BiasModel, CovarianceModel, Shapes, Stream, Vector6
@@ -92,7 +92,7 @@ class Model(BiasModel):
         out.ode = None if self.ode is None else self.ode.at(rate_hz)
         return out
 
-    def error(self, sensor: Sensor, signals: Signals) -> Float64[np.ndarray, "n 3"]:
+    def error(self, sensor: Sensor, signals: Signals) -> Vectors:
         """Error of the effects at some signals (rad/s or m/s²)."""
         return self._compiled(sensor)(signals)
 
@@ -154,8 +154,8 @@ def _roots_at(
     effects: Mapping[Sensor, tuple[LinearForm, ...]],
     roots: Mapping[Sensor, Float64[np.ndarray, "3 q p"]],
     t_s: Float64[np.ndarray, " n"],
-    gyro: Float64[np.ndarray, "n 3"],
-    accel: Float64[np.ndarray, "n 3"],
+    gyro: Vectors,
+    accel: Vectors,
 ) -> dict[Sensor, Float64[np.ndarray, "n 3 p"]]:
     """Roots at each sample; a closure's filter would be shared by a copy."""
     signals, out = filter_(t_s, gyro, accel), {}

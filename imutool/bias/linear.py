@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6, Vectors
 from imutool.bias.model import BiasModel, CovarianceModel, Shapes, Stream, Vector6, matrices
 from imutool.config import Settings
 from imutool.units import SENSORS, Sensor
@@ -68,20 +68,20 @@ def _affine(
     by_gyro: Float64[np.ndarray, "3 3"],
     by_accel: Float64[np.ndarray, "3 3"],
     t_s: Float64[np.ndarray, " n"],
-    gyro: Float64[np.ndarray, "n 3"],
-    accel: Float64[np.ndarray, "n 3"],
-) -> Float64[np.ndarray, "n 6"]:
+    gyro: Vectors,
+    accel: Vectors,
+) -> Rows6:
     """Bias rest + W u; a function of the module, so that a stream can be pickled."""
-    bias: Float64[np.ndarray, "n 6"] = rest + np.concatenate([gyro @ by_gyro, accel @ by_accel], axis=1)
+    bias: Rows6 = rest + np.concatenate([gyro @ by_gyro, accel @ by_accel], axis=1)
     return bias
 
 
 def _roots_at(
     roots: Mapping[Sensor, Float64[np.ndarray, "3 3 p"]],
     t_s: Float64[np.ndarray, " n"],
-    gyro: Float64[np.ndarray, "n 3"],
-    accel: Float64[np.ndarray, "n 3"],
+    gyro: Vectors,
+    accel: Vectors,
 ) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
     """Roots at each sample; a function of the module, as `_affine`."""
-    samples: dict[Sensor, Float64[np.ndarray, "n 3"]] = {"gyro": gyro, "accel": accel}
+    samples: dict[Sensor, Vectors] = {"gyro": gyro, "accel": accel}
     return {sensor: np.einsum("nj,ijp->nip", u, roots[sensor]) for sensor, u in samples.items()}

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Float64, Int64, Rows6, Vectors
 from imutool.bias.model import COLUMNS, BiasModel, Covariances, Vector6
 from imutool.bias.temperature import TemperatureFilter, celsius_of, channel_of, holding, scale_of
 from imutool.errors import ModelError
@@ -28,8 +28,6 @@ MAX_NOISE = 4.0  # ratio to the residuals of the training logs; training logs up
 MAX_RATE = 0.01  # relative difference of rates: it changes a conv with random weights by 5 %, one that ships by nothing
 SURE = 3.0  # deviations of a median step
 MAX_BEYOND_K = 1.0  # beyond the trained range, before it counts as another one
-Rows3 = Float64[np.ndarray, "n 3"]
-Rows6 = Float64[np.ndarray, "n 6"]
 Stamps = Int64[np.ndarray, " n"]
 
 
@@ -59,7 +57,7 @@ def at_rate(model: BiasModel, rate_hz: float, where: object, t_ns: Stamps | None
     raise ModelError(what, where=where, expected=expected, fix=fix)
 
 
-def other_conditions(model: BiasModel, samples: tuple[Float64[np.ndarray, " n"], Rows3, Rows3]) -> list[str]:
+def other_conditions(model: BiasModel, samples: tuple[Float64[np.ndarray, " n"], Vectors, Vectors]) -> list[str]:
     """Sentences on noise and rate of some samples that the training logs did not have."""
     sentences = []
     steps = np.diff(samples[0])
@@ -98,7 +96,7 @@ class TemperatureDrift:
             self._bias[:, COLUMNS[sensor]] = terms @ K
             self._beyond[:, COLUMNS[sensor]] = beyond @ K
 
-    def __call__(self, t_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
+    def __call__(self, t_ns: Int64[np.ndarray, " n"]) -> Rows6:
         """Drift at some stamps: gyro (rad/s), then accel (m/s²)."""
         return np.asarray(self._bias[holding(self._t_ns, t_ns)])
 
@@ -214,7 +212,7 @@ def _widened(model: BiasModel, spread: Vector6, walk: Vector6) -> BiasModel:
     return model
 
 
-def rows_without_drift(model: BiasModel, t_ns: Stamps, gyro: Rows3, accel: Rows3) -> tuple[Rows3, Rows3]:
+def rows_without_drift(model: BiasModel, t_ns: Stamps, gyro: Vectors, accel: Vectors) -> tuple[Vectors, Vectors]:
     """Gyro and accel without the drift that a model follows in their log."""
     if model.log_drift is None:
         return gyro, accel

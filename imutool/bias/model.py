@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Float64, Int64, Rows6, Vectors
 from imutool.config import Settings
 from imutool.units import SENSORS, Sensor
 
@@ -46,16 +46,14 @@ TEMPERATURE_SHAPES: Shapes = {  # of the temperature in training: range (°C, K)
 class Stream(Protocol):
     """Bias stream of a model over blocks of any size; it keeps its state between them."""
 
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 6"]:
+    def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Rows6:
         """Bias at each sample from this and earlier samples only; block borders change nothing."""
 
 
 class BiasEstimate(NamedTuple):
     """Bias at each sample, gyro (rad/s) then accel (m/s²), and its covariance."""
 
-    bias: Float64[np.ndarray, "n 6"]
+    bias: Rows6
     covariance: Covariances
 
 
@@ -63,9 +61,7 @@ class BiasEstimate(NamedTuple):
 class RestBiasEstimator(Protocol):
     """Bias stream with the covariance of the rest bias, for blocks of any size."""
 
-    def estimate(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> BiasEstimate:
+    def estimate(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> BiasEstimate:
         """Bias at each sample, and the covariance of its rest bias."""
 
 
@@ -91,7 +87,7 @@ class LogDrift(Protocol):
 
     name: str  # of the channel
 
-    def __call__(self, t_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
+    def __call__(self, t_ns: Int64[np.ndarray, " n"]) -> Rows6:
         """Drift at some stamps: gyro (rad/s), then accel (m/s²)."""
 
     def covariance(self, t_ns: Int64[np.ndarray, " n"]) -> Covariances:
@@ -204,9 +200,7 @@ class _Stretches:
         self._stream = model.stretch(rest)
         self._one = getattr(self._stream, "one", None)
 
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 6"]:
+    def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Rows6:
         """Bias at each sample."""
         if not len(t_s):
             return np.zeros((0, 6))

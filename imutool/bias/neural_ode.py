@@ -33,7 +33,7 @@ from typing import Annotated, ClassVar, Literal
 import msgspec
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6, Vectors
 from imutool.bias.effects_stream import EffectsStream
 from imutool.bias.model import COLUMNS, Array, BiasModel, DriftStream, Shapes, Vector6
 from imutool.bias.neural_stream import HALF_ROOT, Curves, CurveWeights, NeuralStream, erf, gelu
@@ -258,9 +258,7 @@ class PaperStream:
         self._drifts, self.rest, self._rate_hz = drifts, rest.astype(np.float64), rate_hz
         self._u, self._slope, self._t_s = np.zeros(6), np.zeros(6), math.nan
 
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 6"]:
+    def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Rows6:
         """Bias at each sample."""
         bias = np.empty((len(t_s), 6))
         for k, (t, u) in enumerate(zip(t_s.tolist(), np.concatenate([gyro, accel], axis=1), strict=True)):

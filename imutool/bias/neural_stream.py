@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6, Vectors
 from imutool.bias.model import COLUMNS, Array, Vector6
 from imutool.sensor.signals import low_pass
 from imutool.units import Sensor
@@ -70,7 +70,7 @@ class Curves:
         self._last[:, -1] -= self(np.zeros((1, 6)), np.zeros((1, 6)))[0]
         self.add_line(np.zeros(6), np.zeros(6))
 
-    def __call__(self, u: Float64[np.ndarray, "n 6"], slow: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+    def __call__(self, u: Rows6, slow: Rows6) -> Rows6:
         """Motion-dependent bias of both sensors."""
         out = np.empty((len(u), 6))
         for k in range(0, len(u), ROWS):
@@ -183,9 +183,7 @@ class NeuralStream:
         """Latest rest bias: that of the last step of the drift."""
         return self._rest
 
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 6"]:
+    def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Rows6:
         """Bias at each sample of a block, gyro (rad/s) then accel (m/s²)."""
         if len(t_s) == 1:
             return self.one(float(t_s[0]), np.concatenate([gyro[0], accel[0]]))[None]
@@ -216,7 +214,7 @@ class NeuralStream:
                 self._step(t_s, self._rest + since_s * self._slope, self._drift_input)
         return bias
 
-    def _rest_path(self, t_s: Float64[np.ndarray, " n"], seen: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+    def _rest_path(self, t_s: Float64[np.ndarray, " n"], seen: Rows6) -> Rows6:
         """Rest bias at each sample."""
         rest, k = np.empty((len(t_s), 6)), 0
         while k < len(t_s):

@@ -19,7 +19,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6, Vectors
 from imutool.bias import hybrid, static
 from imutool.bias.model import BiasModel, CovarianceModel, DriftStream, Shapes, Stream, Vector6
 from imutool.config import Settings
@@ -98,8 +98,8 @@ def _shifted(
     root_at: CovarianceModel,
     b: Vector6,
     t_s: Float64[np.ndarray, " n"],
-    gyro: Float64[np.ndarray, "n 3"],
-    accel: Float64[np.ndarray, "n 3"],
+    gyro: Vectors,
+    accel: Vectors,
 ) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
     return root_at(t_s, gyro - b[:3], accel - b[3:])
 
@@ -110,9 +110,7 @@ class _ShiftedStream:
     def __init__(self, inner: DriftStream, b: Vector6) -> None:
         self._inner, self._b = inner, b
 
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 6"]:
+    def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Rows6:
         return self._inner(t_s, gyro - self._b[:3], accel - self._b[3:])
 
     @property

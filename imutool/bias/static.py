@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6, Vectors
 from imutool.bias.model import BiasModel, CovarianceModel, Stream, Vector6
 from imutool.config import Settings
 from imutool.units import Sensor
@@ -56,18 +56,16 @@ class Model(BiasModel):
         first: list[Float64[np.ndarray, "3"]] = []
 
         def root_at(
-            t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+            t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors
         ) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
             if not first:
                 first.append(accel[0].copy())
-            samples: dict[Sensor, Float64[np.ndarray, "n 3"]] = {"gyro": gyro, "accel": accel - first[0]}
+            samples: dict[Sensor, Vectors] = {"gyro": gyro, "accel": accel - first[0]}
             return {sensor: np.einsum("ip,nj->nipj", spread, u).reshape(len(u), 3, 9) for sensor, u in samples.items()}
 
         return root_at
 
 
-def _constant(
-    rest: Vector6, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-) -> Float64[np.ndarray, "n 6"]:
+def _constant(rest: Vector6, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Rows6:
     """The rest bias in each row; a function of the module, so that a stream can be pickled."""
     return np.broadcast_to(rest, (len(t_s), 6)).copy()

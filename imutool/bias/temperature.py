@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Float64, Int64, Vectors
 from imutool.bias.model import BiasModel
 from imutool.errors import ModelError
 from imutool.mcap_io.temperature import is_temperature, thinned
@@ -117,7 +117,7 @@ class TemperatureFilter:
         return self._z.ravel().copy()
 
 
-def _straight_on(s: Float64[np.ndarray, " n"] | float) -> Float64[np.ndarray, "n 3"]:
+def _straight_on(s: Float64[np.ndarray, " n"] | float) -> Vectors:
     """What Legendre polynomials gain beyond -1 to 1 by their slope at the end."""
     beyond = np.reshape(s - np.clip(s, -1.0, 1.0), (-1, 1)).clip(-MAX_BEYOND, MAX_BEYOND)
     return np.asarray(beyond * [1.0, 3.0, 6.0] * np.sign(beyond) ** [0, 1, 2])

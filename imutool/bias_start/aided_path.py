@@ -19,7 +19,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Bool, Float64, Rows6
 from imutool.bias.model import Vector6
 from imutool.bias_start.bias_tracking import Aiding, BiasFilter, FilteredBlock, smooth_blocks
 from imutool.bias_start.initial_bias import AT_REST_STD, MIN_STD, InitialBias, relative_samples
@@ -61,7 +61,7 @@ class AidSettings(Settings, frozen=True, kw_only=True):
     rate_window_s: Positive = 0.1
 
 
-def residual_prior(start: InitialBias | None = None, std: Float64[np.ndarray, "n 6"] | None = None) -> BiasPrior:
+def residual_prior(start: InitialBias | None = None, std: Rows6 | None = None) -> BiasPrior:
     """Prior of the bias that is left after a model.
 
     It is as wide as the start states, or less where `std`, the deviation of the subtracted bias, became smaller.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6, Vectors
 from imutool.bias import static
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_blocks, filter_together
@@ -105,14 +105,14 @@ def _pieces(imu: Imu) -> Iterator[Samples]:
         yield t_s[rows], gyro[rows], accel[rows]
 
 
-def _drifts(gyro: Float64[np.ndarray, "n 3"]) -> bool:
+def _drifts(gyro: Vectors) -> bool:
     """Whether the mean of a gyro at rest moves from the first third of a stop to the last, as while it warms up."""
     first, _, last = np.array_split(gyro, 3)
     noise = np.sqrt(2.0 * gyro.var(axis=0) / max(len(first), 1))
     return bool((np.abs(last.mean(axis=0) - first.mean(axis=0)) > MAX_UNKNOWN + MAX_DEVIATIONS * noise).any())
 
 
-def _at_rest_variance(model: BiasModel, samples: Float64[np.ndarray, "n 6"]) -> Vector6:
+def _at_rest_variance(model: BiasModel, samples: Rows6) -> Vector6:
     """Variance of the mean of samples at rest about the gyro's bias in motion; nothing of the accelerometer's."""
     variance: Vector6 = bias_prior(model).ground_std ** 2 + samples.var(axis=0) / len(samples)
     variance[3:] = np.inf

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Float64, Int64, Rows6, Vectors
 from imutool.bias.model import COLUMNS, BiasEstimate, BiasModel, Covariances
 from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.stretches import measured
@@ -42,7 +42,7 @@ class EstimateParts(NamedTuple):
     `bias.model.CovarianceModel`.
     """
 
-    bias: Float64[np.ndarray, "n 6"]
+    bias: Rows6
     rest: Covariances
     calibration: Roots
 
@@ -57,18 +57,14 @@ class BiasEstimator:
         self._rest, self._calibration = start.estimator(model), model.calibration_covariance()
         self._mean = _RunningMean() if start.tracked else None
 
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> BiasEstimate:
+    def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> BiasEstimate:
         """Bias and its covariance at each sample."""
         bias, P, calibration = self.parts(t_s, gyro, accel)
         for sensor, S in calibration.items():
             P[:, COLUMNS[sensor], COLUMNS[sensor]] += S @ S.transpose(0, 2, 1)
         return BiasEstimate(bias, P)
 
-    def parts(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> EstimateParts:
+    def parts(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> EstimateParts:
         """Bias with the calibration's covariance as roots, for means over many samples."""
         bias, P = self._rest.estimate(t_s, gyro, accel)
         roots: Roots = {} if self._calibration is None or not len(t_s) else self._calibration(t_s, gyro, accel)
@@ -135,7 +131,7 @@ class ExpectedDrift:
 
 
 def drift_by_bias(
-    t_s: Float64[np.ndarray, " n"], q_wb_wxyz: Float64[np.ndarray, "n 4"], force_w: Float64[np.ndarray, "n 3"]
+    t_s: Float64[np.ndarray, " n"], q_wb_wxyz: Float64[np.ndarray, "n 4"], force_w: Vectors
 ) -> Float64[np.ndarray, "n 6 6"]:
     """Drift Jacobian: attitude and velocity at the end of a window by the bias of each sample.
 

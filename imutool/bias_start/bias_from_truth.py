@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64, Int64
+from imutool.array_types import Bool, Float64, Int64, Rows6, Vectors
 from imutool.bias.model import COLUMNS, Array, BiasModel, Vector6
 from imutool.bias_start.bias_at_rest import MAX_UNKNOWN, UNUSUAL, refuted_stops, rest_differences
 from imutool.bias_start.initial_bias import (
@@ -50,7 +50,6 @@ ITERATIONS = 4
 HUBER_MEDIANS = 1.5  # threshold of an outlier, in medians of the residuals, as `inertial.windows`, which imports PyTorch
 MAX_TURN_RAD = 2.0  # by a bias: a turn is known up to pi, so that of a larger bias begins near the median of its steps
 
-Rows = Float64[np.ndarray, "n 3"]
 Quaternions = Float64[np.ndarray, "n 4"]
 
 
@@ -197,9 +196,9 @@ def _updated(start: InitialBias, offset: Vector6, variance: Vector6) -> tuple[Ve
 
 def bias_from_truth(
     t_s: Float64[np.ndarray, " n"],
-    samples: Float64[np.ndarray, "n 6"],
+    samples: Rows6,
     q_wb_wxyz: Quaternions,
-    v_w: Rows,
+    v_w: Vectors,
     trusted: Bool[np.ndarray, " n"],
     mount_std: float = 0.0,
     alone: Bool[np.ndarray, " n"] | None = None,
@@ -244,13 +243,13 @@ def _step_means(u: Array) -> Array:
     return means
 
 
-def _integrated(rate: Rows, dt: Float64[np.ndarray, "m 1"]) -> Float64[np.ndarray, "m 4"]:
+def _integrated(rate: Vectors, dt: Float64[np.ndarray, "m 1"]) -> Float64[np.ndarray, "m 4"]:
     """Rotation from the first sample to each later one."""
     return quaternion.unit(quaternion.running_product(quaternion.exp(_step_means(rate) * dt)))
 
 
 def _attitudes(
-    t_s: Float64[np.ndarray, " n"], rate: Rows, q_wb_wxyz: Quaternions, trusted: Bool[np.ndarray, " n"]
+    t_s: Float64[np.ndarray, " n"], rate: Vectors, q_wb_wxyz: Quaternions, trusted: Bool[np.ndarray, " n"]
 ) -> Quaternions:
     """Integrated attitude, corrected by its error at trusted poses, interpolated in gaps."""
     q_hat = np.concatenate([q_wb_wxyz[:1], quaternion.multiply(q_wb_wxyz[:1], _integrated(rate, np.diff(t_s)[:, None]))])
@@ -260,7 +259,7 @@ def _attitudes(
 
 
 def _slope(
-    error: Rows, by: Float64[np.ndarray, "n 3 3"], valid: Bool[np.ndarray, " n"], by_nuisance: Float64[np.ndarray, "n 3 k"]
+    error: Vectors, by: Float64[np.ndarray, "n 3 3"], valid: Bool[np.ndarray, " n"], by_nuisance: Float64[np.ndarray, "n 3 k"]
 ) -> Float64[np.ndarray, "3"]:
     """b of error = e_0 + by b + by_nuisance z, by least squares with Huber's weights; z ~ N(0, 1)."""
     y = error[valid]

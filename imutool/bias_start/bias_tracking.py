@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Float64, Int64, Rows6, Vectors
 from imutool.bias.model import GAP_S, BiasEstimate, BiasModel
 from imutool.bias_start.prior_width import MAX_CHANGE, MAX_DEVIATIONS, BiasPrior
 from imutool.inertial import inertial_filter
@@ -36,11 +36,11 @@ class BiasTrajectory(NamedTuple):
     rest: Float64[np.ndarray, "m 6"]
     std: Float64[np.ndarray, "m 6"]
 
-    def at(self, t_s: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
+    def at(self, t_s: Float64[np.ndarray, " n"]) -> Rows6:
         """Rest bias at some times."""
         return np.asarray(self.rest[self._row(t_s)])
 
-    def std_at(self, t_s: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
+    def std_at(self, t_s: Float64[np.ndarray, " n"]) -> Rows6:
         """Standard deviation of the rest bias at some times."""
         return np.asarray(self.std[self._row(t_s)])
 
@@ -91,12 +91,10 @@ class BiasFilter:
         self._prior, self._rest_detector, self._drives = prior, OnlineRestDetector(), DriveDetector()
         self._wait = self._rest_detector.blocks_needed - 1 if ahead else 0
         self._waiting: deque[tuple[_Block, bool]] = deque()
-        self._pending: list[tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 6"]]] = []
+        self._pending: list[tuple[Float64[np.ndarray, " n"], Rows6]] = []
         self._close_s = -np.inf
 
-    def feed(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Iterator[FilteredBlock]:
+    def feed(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Iterator[FilteredBlock]:
         """Filtered blocks that these samples complete."""
         yield from itertools.starmap(self._pass, self._ready((t_s, gyro, accel)))
 
@@ -123,7 +121,7 @@ class BiasFilter:
         while self._waiting:
             yield self._pass(*self._waiting.popleft())
 
-    def _arrived(self, t: Float64[np.ndarray, " n"], u: Float64[np.ndarray, "n 6"]) -> Iterator[tuple[_Block, bool]]:
+    def _arrived(self, t: Float64[np.ndarray, " n"], u: Rows6) -> Iterator[tuple[_Block, bool]]:
         dt = t[1:] - t[:-1]
         maximum = GAP_PERIODS * float(quantile(dt, 0.5)) if len(dt) > 1 else BLOCK_S * 1.5
         whole = (longest := float(dt.max())) <= maximum
@@ -218,15 +216,11 @@ class TrackedBiasStream:
         self._held, self._now, self._hold_s, self._prior = known, known.rest[0], hold_s, prior
         self._covariance = np.diag(prior.std**2)
 
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 6"]:
+    def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Rows6:
         """Bias at each sample."""
         return self.estimate(t_s, gyro, accel).bias
 
-    def estimate(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> BiasEstimate:
+    def estimate(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> BiasEstimate:
         """Bias at each sample, and the filter's covariance of the rest bias."""
         bias = self._motion(t_s, gyro, accel) - self._mean
         blocks = list(self.filter.feed(t_s, gyro - bias[:, :3], accel - bias[:, 3:]))
@@ -252,21 +246,17 @@ class TrajectoryBiasStream:
         self.track, self._mean = track, track.rest.mean(axis=0)
         self._motion = model.stream(self._mean)
 
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 6"]:
+    def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Rows6:
         """Bias at each sample."""
-        total: Float64[np.ndarray, "n 6"] = self._motion(t_s, gyro, accel) - self._mean + self.track.at(t_s)
+        total: Rows6 = self._motion(t_s, gyro, accel) - self._mean + self.track.at(t_s)
         return total
 
-    def estimate(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> BiasEstimate:
+    def estimate(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> BiasEstimate:
         """Bias at each sample, and the smoother's variances of the rest bias."""
         return BiasEstimate(self(t_s, gyro, accel), _diagonal(self.track.std_at(t_s) ** 2))
 
 
-def _diagonal(variance: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6 6"]:
+def _diagonal(variance: Rows6) -> Float64[np.ndarray, "n 6 6"]:
     covariance = np.zeros((len(variance), 6, 6))
     covariance[:, range(6), range(6)] = variance
     return covariance

@@ -14,7 +14,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Bool, Float64, Rows6, Vectors
 from imutool.bias.log_binding import OnlineDrift, at_rate, bound
 from imutool.bias.model import GAP_S, BiasModel, SampleStream, Stream, Vector6
 from imutool.bias_start.bias_covariance import BiasEstimator
@@ -37,7 +37,7 @@ class DebiasedImu(NamedTuple):
     """Corrected samples and the subtracted bias: gyro (rad/s), then accel (m/s²)."""
 
     imu: Imu
-    bias: Float64[np.ndarray, "n 6"]
+    bias: Rows6
 
 
 def apply(model: BiasModel, start: InitialBias, imu: Imu) -> DebiasedImu:
@@ -63,7 +63,7 @@ def corrected(model: BiasModel, start: InitialBias, imu: Imu) -> Imu:
     return _imu(imu.t_ns, gyro, accel)
 
 
-def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[DebiasedImu, Float64[np.ndarray, "n 6"]]:
+def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[DebiasedImu, Rows6]:
     """Corrected samples as `apply`, and the standard deviation of the bias at each sample.
 
     Gyro (rad/s), then accel (m/s²); see `imutool.bias_start.bias_covariance`. Computed in blocks, as for a log.
@@ -81,11 +81,11 @@ def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debi
     return _debiased(imu, bias), std
 
 
-def _debiased(imu: Imu, bias: Float64[np.ndarray, "n 6"]) -> DebiasedImu:
+def _debiased(imu: Imu, bias: Rows6) -> DebiasedImu:
     return DebiasedImu(_imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
 
 
-def _imu(t_ns: Times, gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]) -> Imu:
+def _imu(t_ns: Times, gyro: Vectors, accel: Vectors) -> Imu:
     """Samples of columns that nobody else has."""
     for column in (gyro, accel):  # so that the samples need no copy
         column.flags.writeable = False
@@ -97,12 +97,12 @@ def _blocks(count: int) -> Iterator[slice]:
         yield slice(first, first + BLOCK_SAMPLES)
 
 
-def _with_drift(model: BiasModel, imu: Imu, bias: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+def _with_drift(model: BiasModel, imu: Imu, bias: Rows6) -> Rows6:
     """Bias of the samples as recorded, from that of the samples without the drift."""
     return bias if model.log_drift is None else bias + model.log_drift(imu.t_ns)
 
 
-def _to_all(good: Bool[np.ndarray, " n"], values: Float64[np.ndarray, "m 6"]) -> Float64[np.ndarray, "n 6"]:
+def _to_all(good: Bool[np.ndarray, " n"], values: Float64[np.ndarray, "m 6"]) -> Rows6:
     """Values of the measured samples for all samples: one that is no measurement has the value before it."""
     if good.all():
         return values

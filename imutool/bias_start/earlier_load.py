@@ -15,7 +15,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_together
 from imutool.bias_start.fitness import head
@@ -103,7 +103,7 @@ def _log_likelihood(models: Sequence[BiasModel], samples: Samples, first_ns: int
     return np.array(out)
 
 
-def _at_rest(blocks: Sequence[FilteredBlock], t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"]) -> float:
+def _at_rest(blocks: Sequence[FilteredBlock], t_s: Float64[np.ndarray, " n"], gyro: Vectors) -> float:
     """Log-likelihood of the mean rates of blocks at rest, where the gyro reads its bias."""
     missed, covariances = np.zeros((len(blocks), 3)), np.zeros((len(blocks), 3, 3))
     for k, block in enumerate(blocks):

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.bias.log_binding import without_drift
 from imutool.bias.model import (
     GAP_S,
@@ -119,9 +119,7 @@ class ConstantBiasStream:
         self._transition = _transition(model.rest_dynamics() * STEP_S)
         self._walk = np.diag(model.walk_std**2) * STEP_S
 
-    def estimate(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> BiasEstimate:
+    def estimate(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> BiasEstimate:
         """Bias at each sample, and the covariance of the rest bias in steps of `STEP_S`."""
         covariance = np.empty((len(t_s), 6, 6))
         ends = [*np.flatnonzero(np.diff(t_s, prepend=self._before_s) > GAP_S).tolist(), len(t_s)]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64, Int64
+from imutool.array_types import Bool, Float64, Int64, Vectors
 from imutool.bias.model import GAP_S
 from imutool.cleaning import rows
 from imutool.cleaning.rules.saturation import at_limit
@@ -37,7 +37,6 @@ AT_ONCE = 1 << 13  # samples
 NOT_FINITE, OUT_OF_RANGE, ZERO_FORCE = "not_finite", "out_of_range", "zero_force"
 
 logger = logging.getLogger(__name__)
-Rows3 = Float64[np.ndarray, "n 3"]
 
 
 class Stretch(NamedTuple):
@@ -55,7 +54,7 @@ class Stretch(NamedTuple):
         return not 0.0 < self.step_s <= MAX_GAP_S
 
 
-def unusual_gravity(accel: Rows3, bias: Float64[np.ndarray, "3"] | None = None) -> str:
+def unusual_gravity(accel: Vectors, bias: Float64[np.ndarray, "3"] | None = None) -> str:
     """Sentence on a specific force that is not gravity, by its median or its bias; else empty."""
     size, off = float(quantile(np.linalg.norm(accel, axis=1), 0.5)), 0.0 if bias is None else float(np.linalg.norm(bias))
     low, high = (share * GRAVITY_M_S2 for share in GRAVITY_RANGE)
@@ -65,7 +64,7 @@ def unusual_gravity(accel: Rows3, bias: Float64[np.ndarray, "3"] | None = None) 
     return without if off > GRAVITY_M_S2 - low else ""
 
 
-def unmeasured(gyro: Rows3, accel: Rows3) -> Mapping[str, Bool[np.ndarray, " n"]]:
+def unmeasured(gyro: Vectors, accel: Vectors) -> Mapping[str, Bool[np.ndarray, " n"]]:
     """Samples that are no measurement: not finite, beyond any sensor, or without specific force."""
     u = np.concatenate([gyro, accel], axis=1)
     size = np.abs(u)
@@ -75,7 +74,7 @@ def unmeasured(gyro: Rows3, accel: Rows3) -> Mapping[str, Bool[np.ndarray, " n"]
     return {NOT_FINITE: not_finite, OUT_OF_RANGE: out_of_range, ZERO_FORCE: zero}
 
 
-def measured(gyro: Rows3, accel: Rows3) -> Bool[np.ndarray, " n"]:
+def measured(gyro: Vectors, accel: Vectors) -> Bool[np.ndarray, " n"]:
     """Samples that are a measurement."""
     good = np.empty(len(gyro), bool)
     for first in range(0, len(gyro), AT_ONCE):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator
 
+from imutool.array_types import Rows6, Vectors
 from imutool.blind_cases import effects as forward
 from imutool.blind_cases.effects import (
     ACCEL,
@@ -19,10 +20,8 @@ from imutool.blind_cases.effects import (
     Model,
     Parameter,
     Reading,
-    Six,
     Stage,
     Theta,
-    Three,
     Times,
     on,
 )
@@ -44,17 +43,14 @@ NO_LIMIT = 1e9  # a sensor that never clips
 CLIPPED_PERCENT = 5.0
 
 
-def clipping(theta: Theta, size: float, signal: Six) -> Theta:
-    """Limits that clip the largest axis 5 % of the time at the plausible size.
-
-    A quarter of that at a quarter of it.
-    """
+def clipping(theta: Theta, size: float, signal: Rows6) -> Theta:
+    """Limits that clip the largest axis 5 % of the time at the plausible size, and less at a smaller."""
     share = 100.0 - CLIPPED_PERCENT * size
     at = np.array([np.percentile(np.abs(signal[:, part]).max(axis=1), share) for part in (GYRO, ACCEL)])
     return np.where(theta < NO_LIMIT, at, NO_LIMIT)
 
 
-def _quicker(theta: Theta, size: float, signal: Six) -> Theta:
+def _quicker(theta: Theta, size: float, signal: Rows6) -> Theta:
     """A cut-off grows as the effect shrinks: its time constant is the amount."""
     return theta / size
 
@@ -76,22 +72,22 @@ def _by_scene(*_: Any) -> None:
     """Stamps and reference are the scene's."""
 
 
-def quadratic(values: Three, k: Theta, t_s: Times) -> Three:
+def quadratic(values: Vectors, k: Theta, t_s: Times) -> Vectors:
     """(1 + k v) v."""
     return np.asarray(values * (1.0 + k * values))
 
 
-def two_gains(values: Three, a: Theta, t_s: Times) -> Three:
+def two_gains(values: Vectors, a: Theta, t_s: Times) -> Vectors:
     """(1 + a / 2) v where v is positive, (1 - a / 2) v where it is negative."""
     return np.where(values > 0.0, values * (1.0 + 0.5 * a), values * (1.0 - 0.5 * a))
 
 
-def dead_band(values: Three, width: Theta, t_s: Times) -> Three:
+def dead_band(values: Vectors, width: Theta, t_s: Times) -> Vectors:
     """Zero below the width."""
     return np.where(np.abs(values) < width[0], 0.0, values)
 
 
-def play(values: Three, width: Theta, t_s: Times) -> Three:
+def play(values: Vectors, width: Theta, t_s: Times) -> Vectors:
     """What a reading is dragged along by, with so much play on both sides."""
     out, dragged = np.empty_like(values), values[0]
     for k, value in enumerate(values):
@@ -180,7 +176,7 @@ CATALOGUE: Mapping[str, Model] = {
 # ── without a name ──
 
 
-def channels(rng: Generator, t_s: Times, motion: Six) -> dict[str, Times]:
+def channels(rng: Generator, t_s: Times, motion: Rows6) -> dict[str, Times]:
     """Other channels of a log, on their own clock.
 
     `motion` are the samples of an ideal IMU at these times, which the rotor follows a little. Every case has all channels,
@@ -235,7 +231,7 @@ def follower(topic: str, column: int, gain: float = 1.0) -> Model:
     sensor = "gyro" if column < 3 else "accel"
     unit = f"{'rad/s' if column < 3 else 'm/s^2'} per {TOPICS[topic]}"
 
-    def act(reading: Reading, theta: Theta) -> Six:
+    def act(reading: Reading, theta: Theta) -> Rows6:
         out = reading.signal.copy()
         out[:, column] += theta[0] * np.interp(reading.t_s - theta[1], reading.t_s, reading.channels[topic])
         return out
@@ -245,14 +241,14 @@ def follower(topic: str, column: int, gain: float = 1.0) -> Model:
     return Model("driven", Stage.SENSOR, sensor, parameters, act, driver=topic, equation=equation)
 
 
-Term = Callable[[Six, Times, int], Times]
+Term = Callable[[Rows6, Times, int], Times]
 
 
-def _hysteresis(u: Six, t_s: Times, i: int) -> Times:
+def _hysteresis(u: Rows6, t_s: Times, i: int) -> Times:
     return np.asarray(np.sign(np.gradient(u[:, i], t_s)))
 
 
-def _dead_band(u: Six, t_s: Times, i: int) -> Times:
+def _dead_band(u: Rows6, t_s: Times, i: int) -> Times:
     return np.where(np.abs(u[:, i]) < KNEE_RAD_S, -u[:, i], 0.0)
 
 
@@ -277,7 +273,7 @@ def unknown(rng: Generator, form: str | None) -> tuple[Model, Theta]:
         out_axis = i
     column = out_axis + (0 if output == "gyro" else 3)
 
-    def act(reading: Reading, theta: Theta) -> Six:
+    def act(reading: Reading, theta: Theta) -> Rows6:
         out = reading.signal.copy()
         out[:, column] += theta[0] * term(reading.signal, reading.t_s, i)
         return out

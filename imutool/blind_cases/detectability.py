@@ -17,9 +17,9 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6
 from imutool.blind_cases.catalogue import AXES, CATALOGUE
-from imutool.blind_cases.effects import ACCEL, GYRO, Model, Six, Stage, Theta, Times
+from imutool.blind_cases.effects import ACCEL, GYRO, Model, Stage, Theta, Times
 from imutool.blind_cases.envelope import Location, Marks, Rms
 from imutool.blind_cases.scene import RATE_HZ, Acting, Scene
 
@@ -58,7 +58,7 @@ class Detectability:
     t_s: Times
     columns: dict[str, list[Float64[np.ndarray, "m _"]]]
 
-    def whitened(self, misfit: Six) -> Float64[np.ndarray, " m"]:
+    def whitened(self, misfit: Rows6) -> Float64[np.ndarray, " m"]:
         """Misfit over the noise, without its mean (a bias), scaled to all samples."""
         return np.asarray(((misfit - misfit.mean(axis=0)) / self.scene.sigma).ravel() * np.sqrt(DECIMATION))
 
@@ -179,7 +179,7 @@ def _deviations(jacobian: Float64[np.ndarray, "m p"]) -> list[float]:
 # ── where it can be seen ──
 
 
-def location(misfit: Six, sigma: Theta) -> Location:
+def location(misfit: Rows6, sigma: Theta) -> Location:
     """Marks of each second and axis by sensor, and whether the misfit has a location in time.
 
     `misfit`: real minus simulated samples without noise, at 200 Hz; `sigma`: the standard deviation of the noise, by column.
@@ -198,7 +198,7 @@ def location(misfit: Six, sigma: Theta) -> Location:
     return Location(WINDOW_S, *marks)
 
 
-def achievable_rms(misfit: Six, sigma: Theta) -> dict[str, Rms]:
+def achievable_rms(misfit: Rows6, sigma: Theta) -> dict[str, Rms]:
     """Root mean square of real minus simulated samples by sensor, bias removed.
 
     It has two values: of misfit and noise together, and of the noise alone.

@@ -17,13 +17,11 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.signal import cont2discrete, lfilter, lfilter_zi
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6, Vectors
 from imutool.blind_cases.motion import Kinematics
 from imutool.recording import GRAVITY_M_S2
 
 Theta = Float64[np.ndarray, " _"]  # each effect has its own number of parameters
-Six = Float64[np.ndarray, "n 6"]
-Three = Float64[np.ndarray, "n 3"]
 Columns = Float64[np.ndarray, "n k"]
 Times = Float64[np.ndarray, " n"]
 EARTH_RAD_S = 7.292115e-5
@@ -66,7 +64,7 @@ class Reading:
     """
 
     t_s: Times
-    signal: Six
+    signal: Rows6
     channels: Mapping[str, Times]
 
 
@@ -76,8 +74,9 @@ class Model:
 
     Attributes:
         signal: gyro, accel or both.
-        act: IDEAL (Kinematics, theta) -> Six that is added; MOUNT and BANDWIDTH (rate_hz, Six, theta) -> Six; CLOCK
-            (t, theta) -> t; SENSOR (Reading, theta) -> Six; CONVERTER (Six, theta) -> Six. STAMPS and REFERENCE: by the scene.
+        act: IDEAL (Kinematics, theta) -> Rows6 that is added; MOUNT and BANDWIDTH (rate_hz, Rows6, theta) -> Rows6; CLOCK
+            (t, theta) -> t; SENSOR (Reading, theta) -> Rows6; CONVERTER (Rows6, theta) -> Rows6. STAMPS and REFERENCE: by
+            the scene.
         strengthen: parameters at another size, where that is more than multiplying the amounts.
         driver: the topic that it follows, if any.
         smooth: differentiable in its parameters, as Fisher's information requires.
@@ -88,7 +87,7 @@ class Model:
     signal: str
     parameters: tuple[Parameter, ...]
     act: Callable[..., Any]
-    strengthen: Callable[[Theta, float, Six], Theta] | None = None
+    strengthen: Callable[[Theta, float, Rows6], Theta] | None = None
     driver: str = ""
     equation: str = ""
     smooth: bool = True
@@ -103,7 +102,7 @@ class Model:
         """Mask of the parameters that grow with the size."""
         return np.array([parameter.amount for parameter in self.parameters])
 
-    def sized(self, theta: Theta, size: float, signal: Six) -> Theta:
+    def sized(self, theta: Theta, size: float, signal: Rows6) -> Theta:
         """Parameters at another size than the plausible one; `signal` is the ideal one."""
         if self.strengthen is not None:
             return self.strengthen(theta, size, signal)
@@ -113,12 +112,12 @@ class Model:
 # ── at the point where the sensor sits ──
 
 
-def lever_arm(ideal: Kinematics, r: Theta) -> Six:
+def lever_arm(ideal: Kinematics, r: Theta) -> Rows6:
     """alpha x r + omega x (omega x r)."""
     return _on_accel(np.cross(ideal.alpha, r) + np.cross(ideal.omega, np.cross(ideal.omega, r)))
 
 
-def size_effect(ideal: Kinematics, theta: Theta) -> Six:
+def size_effect(ideal: Kinematics, theta: Theta) -> Rows6:
     """Lever arm of each accelerometer axis: axis i sits at r_i, row i of theta."""
     added = np.zeros_like(ideal.f)
     for axis, r in enumerate(theta.reshape(3, 3)):
@@ -126,7 +125,7 @@ def size_effect(ideal: Kinematics, theta: Theta) -> Six:
     return _on_accel(added)
 
 
-def gravity(ideal: Kinematics, theta: Theta) -> Six:
+def gravity(ideal: Kinematics, theta: Theta) -> Rows6:
     """Gravity g + dg, upwards along Exp(tilt_x, tilt_y, 0) e_z."""
     tilt = np.array([theta[1], theta[2], 0.0])
     angle = float(np.linalg.norm(tilt))
@@ -139,7 +138,7 @@ def gravity(ideal: Kinematics, theta: Theta) -> Six:
     return _on_accel(np.einsum("nji,j->ni", ideal.R_wb, change))
 
 
-def earth_rotation(ideal: Kinematics, theta: Theta) -> Six:
+def earth_rotation(ideal: Kinematics, theta: Theta) -> Rows6:
     """omega_e (cos lat cos heading, cos lat sin heading, sin lat) in the world, z up.
 
     North is at `heading` about z from x.
@@ -152,20 +151,20 @@ def earth_rotation(ideal: Kinematics, theta: Theta) -> Six:
     return added
 
 
-def vibration(ideal: Kinematics, theta: Theta) -> Six:
+def vibration(ideal: Kinematics, theta: Theta) -> Rows6:
     """Line in the spectrum: amplitude_k sin(2 pi f t + phase_k) on each of the six columns."""
     f_hz, amplitude, phase = theta[0], theta[1:7], theta[7:13]
     return np.asarray(amplitude * np.sin(2.0 * np.pi * f_hz * ideal.t_s[:, None] + phase))
 
 
-def _on_accel(added: Three) -> Six:
+def _on_accel(added: Vectors) -> Rows6:
     return np.asarray(np.concatenate([np.zeros_like(added), added], axis=1))
 
 
 # ── mount, bandwidth, clock ──
 
 
-def mount_rotation(rate_hz: float, signal: Six, theta: Theta) -> Six:
+def mount_rotation(rate_hz: float, signal: Rows6, theta: Theta) -> Rows6:
     """R_bi^T on gyro and accel, R_bi = exp([theta]x)."""
     angle = float(np.linalg.norm(theta))
     if angle == 0.0:
@@ -176,7 +175,7 @@ def mount_rotation(rate_hz: float, signal: Six, theta: Theta) -> Six:
     return np.concatenate([signal[:, GYRO] @ R_bi, signal[:, ACCEL] @ R_bi], axis=1)
 
 
-def mount_resonance(rate_hz: float, signal: Six, theta: Theta) -> Six:
+def mount_resonance(rate_hz: float, signal: Rows6, theta: Theta) -> Rows6:
     """Accelerometer axes on a spring and damper, each to its `share`: a + share (H - 1) a."""
     out = signal.copy()
     moved = spring_mount(signal[:, ACCEL], rate_hz, float(theta[0]), float(theta[1])) - signal[:, ACCEL]
@@ -184,12 +183,12 @@ def mount_resonance(rate_hz: float, signal: Six, theta: Theta) -> Six:
     return out
 
 
-def low_pass(rate_hz: float, signal: Six, theta: Theta) -> Six:
+def low_pass(rate_hz: float, signal: Rows6, theta: Theta) -> Rows6:
     """First-order low-pass with the cut-off theta[0] (Hz)."""
     return first_order(signal, rate_hz, float(theta[0]))
 
 
-def gyro_delay(rate_hz: float, signal: Six, theta: Theta) -> Six:
+def gyro_delay(rate_hz: float, signal: Rows6, theta: Theta) -> Rows6:
     """The gyro's columns theta[0] (s) later, held before the first sample."""
     out, at = signal.copy(), np.arange(len(signal), dtype=np.float64)
     late = np.clip(at - theta[0] * rate_hz, 0.0, at[-1])
@@ -229,13 +228,13 @@ def _filtered(signal: Columns, rate_hz: float, numerator: list[float], denominat
 
 # ── the sensor ──
 
-OnOneSensor = Callable[[Three, Theta, Times], Three]
+OnOneSensor = Callable[[Vectors, Theta, Times], Vectors]
 
 
-def on(part: slice, change: OnOneSensor) -> Callable[[Reading, Theta], Six]:
+def on(part: slice, change: OnOneSensor) -> Callable[[Reading, Theta], Rows6]:
     """SENSOR model that changes the three columns of one sensor."""
 
-    def act(reading: Reading, theta: Theta) -> Six:
+    def act(reading: Reading, theta: Theta) -> Rows6:
         out = reading.signal.copy()
         out[:, part] = change(reading.signal[:, part], theta, reading.t_s)
         return out
@@ -243,37 +242,37 @@ def on(part: slice, change: OnOneSensor) -> Callable[[Reading, Theta], Six]:
     return act
 
 
-def scale(values: Three, s: Theta, t_s: Times) -> Three:
+def scale(values: Vectors, s: Theta, t_s: Times) -> Vectors:
     """(1 + s) v."""
     return values * (1.0 + s)
 
 
-def misalignment(values: Three, theta: Theta, t_s: Times) -> Three:
+def misalignment(values: Vectors, theta: Theta, t_s: Times) -> Vectors:
     """(1 + M) v, M without a diagonal."""
     m = np.eye(3)
     m[~np.eye(3, dtype=bool)] = theta
     return values @ m.T
 
 
-def warm_up(values: Three, theta: Theta, t_s: Times) -> Three:
+def warm_up(values: Vectors, theta: Theta, t_s: Times) -> Vectors:
     """v + b (1 - exp(-t / tau))."""
     rise = 1.0 - np.exp(-t_s[:, None] / theta[3])
     return np.asarray(values + rise * theta[:3])
 
 
-def bias_step(values: Three, theta: Theta, t_s: Times) -> Three:
+def bias_step(values: Vectors, theta: Theta, t_s: Times) -> Vectors:
     """v + b from t_step on."""
     return np.where(t_s[:, None] < theta[3], values, values + theta[:3])
 
 
-def g_sensitivity(reading: Reading, theta: Theta) -> Six:
+def g_sensitivity(reading: Reading, theta: Theta) -> Rows6:
     """Gyro + G f."""
     out = reading.signal.copy()
     out[:, GYRO] = reading.signal[:, GYRO] + reading.signal[:, ACCEL] @ theta.reshape(3, 3).T
     return out
 
 
-def temperature(reading: Reading, k: Theta) -> Six:
+def temperature(reading: Reading, k: Theta) -> Rows6:
     """Bias k (T - 25 °C)."""
     return np.asarray(reading.signal + (reading.channels[TEMPERATURE] - T0_C)[:, None] * k)
 
@@ -281,13 +280,13 @@ def temperature(reading: Reading, k: Theta) -> Six:
 # ── the converter ──
 
 
-def saturation(signal: Six, theta: Theta) -> Six:
+def saturation(signal: Rows6, theta: Theta) -> Rows6:
     """Clips at the limits of gyro and accel."""
     limits = np.repeat(theta, 3)
     return np.asarray(np.clip(signal, -limits, limits))
 
 
-def quantization(signal: Six, theta: Theta) -> Six:
+def quantization(signal: Rows6, theta: Theta) -> Rows6:
     """Rounds to the LSB of gyro and accel; an LSB of zero rounds nothing."""
     lsb = np.repeat(theta, 3)
     return np.where(lsb > 0.0, np.round(signal / np.where(lsb > 0.0, lsb, 1.0)) * lsb, signal)

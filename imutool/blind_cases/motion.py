@@ -14,7 +14,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.errors import DataError
 from imutool.recording import GRAVITY_M_S2, Poses, seconds
 
@@ -25,7 +25,6 @@ SPURIOUS = (0.1, 0.1)  # m/s² and rad/s²: how much of the second derivative ma
 SHORTEST_S = 20.0
 KEPT = 3  # vectors of times: those of a misfit, and the finer ones before a filter
 
-Vectors = Float64[np.ndarray, "n 3"]
 Times = Float64[np.ndarray, " n"]
 Knots = Float64[np.ndarray, " m"]
 

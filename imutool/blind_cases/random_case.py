@@ -19,11 +19,11 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.random import Generator
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6
 from imutool.blind_cases import catalogue
 from imutool.blind_cases.catalogue import CATALOGUE, NO_LIMIT, clipping
 from imutool.blind_cases.detectability import Detectability, detectable_misfit
-from imutool.blind_cases.effects import ACCEL, GYRO, Model, Six, Stage, Theta
+from imutool.blind_cases.effects import ACCEL, GYRO, Model, Stage, Theta
 from imutool.errors import ConfigError, DataError
 from imutool.noise.datasheet import SHEETS, Noise
 
@@ -191,7 +191,7 @@ def _hidden(kind: str, size: str, effects: Sequence[str]) -> DataError:
 # ── parameters at the plausible size ──
 
 
-def draw_parameters(model: Model, rng: Generator, signal: Six, noise: Sigma, duration_s: float) -> Theta:
+def draw_parameters(model: Model, rng: Generator, signal: Rows6, noise: Sigma, duration_s: float) -> Theta:
     """Random parameters at the plausible size.
 
     Amounts are Gaussian with a root mean square of one plausible size, every second time on a single axis; the others are
@@ -221,7 +221,7 @@ def _either_sign(rng: Generator, value: float) -> Theta:
     return np.array([value * rng.choice([-1.0, 1.0])])
 
 
-def _line(rng: Generator, signal: Six, noise: Sigma, duration_s: float) -> Theta:
+def _line(rng: Generator, signal: Rows6, noise: Sigma, duration_s: float) -> Theta:
     which = rng.choice(3, p=[0.2, 0.6, 0.2])
     amplitude = np.abs(rng.standard_normal(6)) + 0.2
     amplitude[GYRO] *= 0.1 * (which != 1)
@@ -229,29 +229,29 @@ def _line(rng: Generator, signal: Six, noise: Sigma, duration_s: float) -> Theta
     return np.concatenate([[rng.uniform(15.0, 80.0)], amplitude, rng.uniform(0.0, 2.0 * np.pi, 6)])
 
 
-def _resonance(rng: Generator, signal: Six, noise: Sigma, duration_s: float) -> Theta:
+def _resonance(rng: Generator, signal: Rows6, noise: Sigma, duration_s: float) -> Theta:
     share = np.ones(3) if rng.random() < 0.4 else rng.permutation([1.0, rng.uniform(0.0, 0.5), 0.0])
     return np.array([np.exp(rng.uniform(np.log(3.0), np.log(30.0))), rng.uniform(0.05, 0.4), *share])
 
 
-def _limits(rng: Generator, signal: Six, noise: Sigma, duration_s: float) -> Theta:
+def _limits(rng: Generator, signal: Rows6, noise: Sigma, duration_s: float) -> Theta:
     """Which sensor clips; `clipping` gives the limit."""
     which = rng.choice(3, p=[0.4, 0.4, 0.2])
     return clipping(np.array([NO_LIMIT * (which == 1), NO_LIMIT * (which == 0)]), 1.0, signal)
 
 
-def _lsb(rng: Generator, signal: Six, noise: Sigma, duration_s: float) -> Theta:
+def _lsb(rng: Generator, signal: Rows6, noise: Sigma, duration_s: float) -> Theta:
     """Eight standard deviations of the noise."""
     which = rng.choice(3)
     return 8.0 * np.array([noise[0] * (which != 1), noise[3] * (which != 0)])
 
 
-def _gaps(rng: Generator, signal: Six, noise: Sigma, duration_s: float) -> Theta:
+def _gaps(rng: Generator, signal: Rows6, noise: Sigma, duration_s: float) -> Theta:
     starts = (np.arange(3) + rng.uniform(0.2, 0.7, 3)) * duration_s / 3.0
     return np.array([2.0, *starts])
 
 
-_SPECIAL: Mapping[str, Callable[[Generator, Six, Sigma, float], Theta]] = {
+_SPECIAL: Mapping[str, Callable[[Generator, Rows6, Sigma, float], Theta]] = {
     "clock_offset": lambda rng, *_: _either_sign(rng, 0.05),
     "clock_skew": lambda rng, *_: _either_sign(rng, 1e-3),
     "clock_jump": lambda rng, signal, noise, span: np.array([rng.uniform(0.25, 0.75) * span, *_either_sign(rng, 0.05)]),

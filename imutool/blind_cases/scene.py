@@ -12,9 +12,9 @@ import numpy as np
 from numpy.random import Generator
 from scipy.interpolate import make_interp_spline
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Float64, Int64, Rows6
 from imutool.blind_cases import catalogue
-from imutool.blind_cases.effects import Model, Reading, Six, Stage, Theta, Times
+from imutool.blind_cases.effects import Model, Reading, Stage, Theta, Times
 from imutool.blind_cases.motion import SHORTEST_S, Kinematics, Motion, Smoother
 from imutool.errors import ConfigError, DataError
 from imutool.noise.datasheet import Noise
@@ -60,7 +60,7 @@ class Scene:
         """Kinematics of the tracked point."""
         return replace(self.motion.kinematics(t_s + self.start_s), t_s=np.asarray(t_s, dtype=np.float64))
 
-    def ideal(self, t_s: Times) -> Six:
+    def ideal(self, t_s: Times) -> Rows6:
         """Samples of an ideal sensor."""
         ideal = self.kinematics(t_s)
         return np.concatenate([ideal.omega, ideal.f], axis=1)
@@ -69,7 +69,7 @@ class Scene:
         """Channels at some times."""
         return {topic: np.interp(t_s, self.channel_t_s, values) for topic, values in self.channels.items()}
 
-    def converter_input(self, acting: Acting, t_s: Times) -> Six:
+    def converter_input(self, acting: Acting, t_s: Times) -> Rows6:
         """Signal before the converter, without noise, a row for each true-clock time of a sample."""
         order = sorted(acting, key=lambda pair: _place(pair[0]))
         taken = np.asarray(t_s, dtype=np.float64)
@@ -83,7 +83,7 @@ class Scene:
                 signal = model.act(Reading(t_s, signal, self.channels_at(t_s)), theta)
         return signal
 
-    def _through_mount(self, order: Acting, mounted: Acting, taken: Times) -> Six:
+    def _through_mount(self, order: Acting, mounted: Acting, taken: Times) -> Rows6:
         dynamic = any(model.name in FILTERS for model, _ in mounted)
         first = min(float(taken[0]), 0.0) - SETTLE_S
         count = int((float(taken[-1]) + 0.2 - first) * GRID_HZ)
@@ -95,7 +95,7 @@ class Scene:
             signal = model.act(GRID_HZ, signal, theta)
         return np.asarray(make_interp_spline(grid, signal, k=3)(taken)) if dynamic else signal
 
-    def converter_output(self, acting: Acting, signal: Six) -> Six:
+    def converter_output(self, acting: Acting, signal: Rows6) -> Rows6:
         """Signal after the converter: clipped, then rounded."""
         rank = {"saturation": 0, "quantization": 1}
         for model, theta in sorted(acting, key=lambda pair: rank.get(pair[0].name, 0)):
@@ -114,11 +114,11 @@ class Scene:
         """Intervals that the reference lost, on the clock of its poses (s)."""
         return tuple((self.start_s + start, self.start_s + start + float(theta[0])) for start in theta[1:].tolist())
 
-    def expected(self, acting: Acting, t_s: Times) -> Six:
+    def expected(self, acting: Acting, t_s: Times) -> Rows6:
         """Samples of the simulation without noise: ideal, along the reference."""
         return replace(self, motion=self.reference(acting)).ideal(t_s)
 
-    def misfit(self, acting: Acting, t_s: Times) -> Six:
+    def misfit(self, acting: Acting, t_s: Times) -> Rows6:
         """Real minus simulated samples, without noise and bias."""
         return np.asarray(self.converter_output(acting, self.converter_input(acting, t_s)) - self.expected(acting, t_s))
 
@@ -192,7 +192,7 @@ def place_scene(smoother: Smoother, noise: Noise, rng: Generator, longest_s: flo
     return replace(scene, channels=catalogue.channels(rng, channel_t, scene.ideal(channel_t)))
 
 
-def _imu(t_s: Times, signal: Six) -> Imu:
+def _imu(t_s: Times, signal: Rows6) -> Imu:
     return Imu(stamps_ns(t_s), np.ascontiguousarray(signal[:, :3]), np.ascontiguousarray(signal[:, 3:]))
 
 

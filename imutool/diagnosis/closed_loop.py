@@ -18,7 +18,7 @@ import numpy as np
 from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6, Vectors
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.result import ClosedLoop, Compared, Diagnosis
 from imutool.diagnosis.to_sensor_files import NO_EFFECT
@@ -134,10 +134,10 @@ class _Stretch(NamedTuple):
     """Samples of which both diagnoses have an expectation."""
 
     t_s: Float64[np.ndarray, " n"]
-    real: Float64[np.ndarray, "n 6"]
-    expected: tuple[Float64[np.ndarray, "n 6"], Float64[np.ndarray, "n 6"]]  # before and after, with the best constant
+    real: Rows6
+    expected: tuple[Rows6, Rows6]  # before and after, with the best constant
 
-    def misfits(self, part: slice) -> list[Float64[np.ndarray, "n 3"]]:
+    def misfits(self, part: slice) -> list[Vectors]:
         """Of a sensor, before and after."""
         return [(self.real - expected)[:, part] for expected in self.expected]
 
@@ -168,7 +168,7 @@ def _compared(stretches: Sequence[_Stretch]) -> Iterator[Compared]:
         yield Compared(f"{name} over {WINDOW_S:g} s", was, is_now, unit)
 
 
-def _rms(x: Float64[np.ndarray, "n 3"]) -> float:
+def _rms(x: Vectors) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
@@ -196,9 +196,7 @@ def _integrated(stretches: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) 
     return float(np.sqrt(np.mean(np.concatenate(angle) ** 2))), float(np.sqrt(np.concatenate(distance).mean()))
 
 
-def _window_ends(
-    samples: Float64[np.ndarray, "n 6"], t_s: Float64[np.ndarray, " n"]
-) -> tuple[Rotation, Float64[np.ndarray, "w 3"]]:
+def _window_ends(samples: Rows6, t_s: Float64[np.ndarray, " n"]) -> tuple[Rotation, Float64[np.ndarray, "w 3"]]:
     """Attitude and displacement at the end of each window, from its own start, gravity included."""
     period_s = float(np.median(np.diff(t_s)))
     count = min(round(WINDOW_S / period_s), len(t_s))

@@ -12,7 +12,7 @@ from scipy.signal import butter, sosfiltfilt, welch
 from scipy.stats import chi2, ttest_1samp
 from scipy.stats import f as fisher
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.noise_estimate import noise_std
@@ -254,7 +254,7 @@ def _on_clock_of(ideal: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:
     return replace(ideal, t_s=t_s, channels=channels)
 
 
-def _read(pair: Pair, ideals: Sequence[IdealMotion], acting: Acting) -> Float64[np.ndarray, "n 6"]:
+def _read(pair: Pair, ideals: Sequence[IdealMotion], acting: Acting) -> Rows6:
     """What the second simulation reads at the recording's stamps; NaN where it has no motion."""
     stamps = [pair.stamp_s[(pair.stamp_s >= ideal.t_s[0]) & (pair.stamp_s <= ideal.t_s[-1])] for ideal in ideals]
     samples = simulate_stretches(ideals, stamps, acting)
@@ -263,9 +263,7 @@ def _read(pair: Pair, ideals: Sequence[IdealMotion], acting: Acting) -> Float64[
     return out
 
 
-def _refuse_unlike(
-    log: WhitenedImu, given: Float64[np.ndarray, "n 6"], plain: Float64[np.ndarray, "n 6"], sim: Recording
-) -> None:
+def _refuse_unlike(log: WhitenedImu, given: Rows6, plain: Rows6, sim: Recording) -> None:
     """Refuse poses so coarse or noisy that they give another simulation than the given one.
 
     Raises:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Bool, Float64, Rows6
 from imutool.file_location import Location
 from imutool.recording import Poses
 from imutool.report import UNSET, Report, Section, UnsetType
@@ -210,12 +210,12 @@ class Traces:
 
     log: str
     t_s: Float64[np.ndarray, " n"]
-    real: Float64[np.ndarray, "n 6"]
-    before: Float64[np.ndarray, "n 6"]  # the simulation and a constant bias
-    after: Float64[np.ndarray, "n 6"]  # with the findings modelled
+    real: Rows6
+    before: Rows6  # the simulation and a constant bias
+    after: Rows6  # with the findings modelled
     held_out: Bool[np.ndarray, " n"]
     truth: Poses | None = None  # at these samples
-    ideal: Float64[np.ndarray, "n 6"] | None = None  # an ideal sensor's samples
+    ideal: Rows6 | None = None  # an ideal sensor's samples
     band_hz: float | None = None  # the expected signal is known below this frequency
     path: str = ""  # of the log, as in `Diagnosis.real`
 

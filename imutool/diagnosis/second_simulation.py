@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Bool, Float64, Rows6
 from imutool.diagnosis.audit.simulation import imu_in, read_simulation
 from imutool.diagnosis.diagnose import read_log
 from imutool.diagnosis.estimation.aligned_log import DEFAULT
@@ -120,5 +120,5 @@ def _at(imu: Imu, stamps: Imu) -> tuple[Bool[np.ndarray, " n"], Float64[np.ndarr
     return inside, np.asarray(make_interp_spline(t_s, _columns(imu), k=3)(at_s[inside]))
 
 
-def _columns(imu: Imu) -> Float64[np.ndarray, "n 6"]:
+def _columns(imu: Imu) -> Rows6:
     return np.concatenate([imu.gyro, imu.accel], axis=1)

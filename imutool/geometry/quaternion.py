@@ -13,10 +13,9 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Float64, Int64, Vectors
 
 Quaternions = Float64[np.ndarray, "n 4"]
-Vectors = Float64[np.ndarray, "n 3"]
 Column = Float64[np.ndarray, " n"]
 OneOrMany = Float64[np.ndarray, "#n 4"]
 NED_FROM_ENU: Quaternions = np.array([[0.0, 0.5**0.5, 0.5**0.5, 0.0]])  # half a turn about north-east, so also ENU from NED

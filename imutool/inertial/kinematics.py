@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from imutool.array_types import Float, Float64
+from imutool.array_types import Float, Float64, Vectors
 from imutool.errors import DataError, NumericsError
 from imutool.geometry import quaternion
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Times, seconds
@@ -26,7 +26,6 @@ G_W.flags.writeable = False
 LEVEL = 0.01  # of gravity, by which the mean force of a body in a room may differ from it
 GRAVITIES_M_S2 = (GRAVITY_M_S2, 9.80665, 9.8)  # of simulators, which know no other
 
-Vectors = Float64[np.ndarray, "n 3"]
 Spline = Any  # a BSpline: scipy.interpolate is imported where one is made, for its import takes 0.2 s
 
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64, Int64
+from imutool.array_types import Bool, Float64, Int64, Vectors
 from imutool.errors import DataError, NumericsError
 from imutool.geometry import quaternion
 from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, Poses, Times, seconds
@@ -29,7 +29,6 @@ COMPARED_S, MIN_SPEED_M_S, MAX_OFF = 1.0, 0.05, 0.5  # of velocities and positio
 WINDOWS_AT_ONCE = 1 << 12  # whose arrays fit a core's cache
 SAMPLES_PER_COEFFICIENT = 3  # a stretch shorter than the window gets a lower order, against noise
 
-Vectors = Float64[np.ndarray, "n 3"]
 Indices = Int64[np.ndarray, " m"]
 Column = Float64[np.ndarray, "m 1"]
 

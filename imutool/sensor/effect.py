@@ -23,7 +23,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.errors import DataError
 from imutool.sensor.samples import IdealMotion, SensorSamples, Times
 from imutool.sensor.signals import Signals
@@ -77,10 +77,10 @@ class CompiledEffect:
     One sample is plain floats: numpy's calls would cost several times the arithmetic.
     """
 
-    block: Callable[[Signals], Float64[np.ndarray, "n 3"]]
+    block: Callable[[Signals], Vectors]
     one: Callable[[float, list[float]], Three]
 
-    def __call__(self, signals: Signals) -> Float64[np.ndarray, "n 3"]:
+    def __call__(self, signals: Signals) -> Vectors:
         """The error at each sample of a block."""
         return self.block(signals)
 
@@ -210,7 +210,7 @@ class Remembered:
         return last[2]
 
 
-def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Vectors, Vectors]:
     """Residual: samples minus the ideal ones at the same stamps, gyro (rad/s) and accel (m/s²).
 
     Good enough to start a fit from.

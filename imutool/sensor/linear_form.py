@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Float64, Int64, Vectors
 from imutool.sensor.effect import CompiledEffect, Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.signals import COUNT, LOAD, Signals
@@ -93,7 +93,7 @@ class LinearForm:
             return self.effect.fast(self._scaled(theta, 1.0))
         at = self._scaled(theta, SCALE)
 
-        def block(signals: Signals) -> Float64[np.ndarray, "n 3"]:
+        def block(signals: Signals) -> Vectors:
             return _error(self.effect, self.sensor, signals, at) / SCALE
 
         def one(t_s: float, row: list[float]) -> Three:
@@ -126,9 +126,9 @@ class CompiledEffects:
         own = int(np.flatnonzero(self.matrix.any(axis=1)).max(initial=-1)) + 1
         return max(own, LOAD.start) if self.others else own
 
-    def __call__(self, signals: Signals) -> Float64[np.ndarray, "n 3"]:
+    def __call__(self, signals: Signals) -> Vectors:
         """The error at each sample of a block."""
-        out: Float64[np.ndarray, "n 3"] = np.dot(signals.columns, self.matrix)
+        out: Vectors = np.dot(signals.columns, self.matrix)
         for other in self.others:
             out += other(signals)
         return out
@@ -202,7 +202,7 @@ def linear_form(effect: Effect, sensor: Sensor) -> LinearForm:
     return LinearForm(effect, sensor, tuple(named), base, free, columns, probes, pattern)
 
 
-def _error(effect: Effect, sensor: Sensor, signals: Signals, theta: Theta) -> Float64[np.ndarray, "n 3"]:
+def _error(effect: Effect, sensor: Sensor, signals: Signals, theta: Theta) -> Vectors:
     """Error of a sensor's samples; of a clock to first order, the shift times the derivative."""
     if effect.stage == Stage.CLOCK:
         shift_s = effect.forward(signals.t_s, theta) - signals.t_s

@@ -13,9 +13,9 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from imutool import config
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.errors import ConfigError
-from imutool.inertial.kinematics import DEGREE, Trajectory, Vectors, continuous
+from imutool.inertial.kinematics import DEGREE, Trajectory, continuous
 from imutool.recording import Imu, Poses, Recording, Scalars, Times, seconds
 
 EPOCH_NS = 1_700_000_000_000_000_000  # a real epoch, so that a lost last digit of a stamp shows

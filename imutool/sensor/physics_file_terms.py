@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.errors import DataError
 from imutool.noise import datasheet
 from imutool.recording import interpolate
@@ -28,7 +28,7 @@ Variable = Callable[[SensorSamples], Float64[np.ndarray, " n"]]
 
 def _column(name: str, axis: int) -> Variable:
     def column(samples: SensorSamples) -> Float64[np.ndarray, " n"]:
-        values: Float64[np.ndarray, "n 3"] = getattr(samples, name)
+        values: Vectors = getattr(samples, name)
         return values[:, axis]
 
     return column

@@ -15,12 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.errors import DataError
 from imutool.sensor.signals import FILTERED, SignalFilter, Signals, vibration_power
 from imutool.units import Sensor
 
-Vectors = Float64[np.ndarray, "n 3"]
 Column = Float64[np.ndarray, "_"]
 Columns = Float64[np.ndarray, "_ _"]
 Times = Float64[np.ndarray, " n"]

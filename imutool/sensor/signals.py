@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.recording import GRAVITY_M_S2
 
 SLOW_S = 0.1  # of the samples: what is faster counts as vibration
@@ -45,7 +45,6 @@ LOAD = slice(27, 27 + len(LOAD_TAU_S) * LOADS)  # the loads behind the first fil
 COUNT = LOAD.stop
 TEMPERATURE_TERMS = 3 * (1 + len(LOAD_TAU_S))  # polynomials of a temperature, at once and behind the filters
 
-Vectors = Float64[np.ndarray, "n 3"]
 Load = Float64[np.ndarray, "3 11"]  # state of a slow drift, by time constant and load
 
 

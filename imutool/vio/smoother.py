@@ -20,14 +20,13 @@ from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
 from imutool import config
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Float64, Int64, Vectors
 from imutool.errors import NumericsError, required
 from imutool.inertial.strapdown import StartPose
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, seconds
 from imutool.report import Progress, silent
 from imutool.vio.camera import EUROC, Frame
 
-Vectors = Float64[np.ndarray, "n 3"]
 Positive = Annotated[float, Meta(gt=0.0)]
 
 INTEGRATION_STD = 1e-4  # m/sqrt(Hz), of the position within a step: what the rule of the mean leaves

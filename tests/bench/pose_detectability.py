@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from imutool.array_types import Rows6
 from imutool.blind_cases import LONGEST_S, POSE_NOISE, plan, random_case
 from imutool.blind_cases.detectability import DECIMATION, Detectability, with_catalogue
-from imutool.blind_cases.effects import Six, Stage
+from imutool.blind_cases.effects import Stage
 from imutool.blind_cases.envelope import ConcealedTruth
 from imutool.blind_cases.scene import POSE_RATE_HZ, RATE_HZ, Scene
 from imutool.errors import DataError
@@ -30,7 +31,7 @@ class PoseDetectability(Detectability):
 
     pose_noise: tuple[float, float] = POSE_NOISE
 
-    def whitened(self, misfit: Six) -> Float64[np.ndarray, " m"]:
+    def whitened(self, misfit: Rows6) -> Float64[np.ndarray, " m"]:
         """Misfit over the noise of sensor and differentiated poses, without its mean, scaled to all samples."""
         centred = misfit - misfit.mean(axis=0)
         dt = DECIMATION / RATE_HZ

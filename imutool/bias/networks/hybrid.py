@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imutool.array_types import Float, Float64
+from imutool.array_types import Float, Float64, Vectors
 from imutool.bias.hybrid import Config, Model
 from imutool.bias.networks import neural_ode
 from imutool.bias.networks.network import BiasNetwork, Segment
@@ -69,7 +69,7 @@ class Network(BiasNetwork):
             fix="Train it with imutool.training.run.train, or its parts with imutool.training.calibration.effect_selection",
         )
 
-    def error(self, sensor: Sensor, signals: Signals) -> Float64[np.ndarray, "n 3"]:
+    def error(self, sensor: Sensor, signals: Signals) -> Vectors:
         """Error of the effects at some signals (rad/s or m/s²)."""
         theta: Tensor = getattr(self, f"theta_{sensor}")
         return compiled(self.effects[sensor], theta.detach().cpu().double().numpy())(signals)

@@ -12,7 +12,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 
 CLEARLY = 0.5  # of the squares of the ideal sensor, up to which another unit, frame or axes are chosen
 ALIKE = 1.1  # times the least squares: hypotheses that explain as much, of which the simplest is taken
@@ -22,7 +22,6 @@ UNSEEN = 1e-4  # of the products of signal and parts: less tells no rotation, as
 MIN_SEEN = 0.01  # of these products, of the axis that moves least, with a turned reflection
 MAX_BIAS = 1.0  # m/s², of the accelerometer: gravity in the world frame is none
 
-Vectors = Float64[np.ndarray, "n 3"]
 Parts = Float64[np.ndarray, "n 3 p"]
 Matrix = Float64[np.ndarray, "3 3"]
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.signal import spectrogram
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.diagnosis.audit.faults import FaultFound, clear, found
 from imutool.diagnosis.audit.motion import KinematicFit, kinematic_fit, kinematics
 from imutool.diagnosis.result import Estimate
@@ -43,9 +43,7 @@ def max_filter_delays(sim: Recording, fit: KinematicFit) -> tuple[float, float]:
     return out[0], out[1]
 
 
-def _is_mean(
-    residual: Float64[np.ndarray, "n 3"], rate: Float64[np.ndarray, "n 3"], t_s: Float64[np.ndarray, " n"], late_s: float
-) -> bool:
+def _is_mean(residual: Vectors, rate: Vectors, t_s: Float64[np.ndarray, " n"], late_s: float) -> bool:
     """Whether a residual is what a mean of the rate over twice its delay leaves: tau^2 / 6 of the rate's curvature."""
     rate = rate - rate.mean(axis=0)
     bent = np.gradient(np.gradient(rate, t_s, axis=0), t_s, axis=0)
@@ -55,7 +53,7 @@ def _is_mean(
     return explained > 0.5 and abs(6.0 * size / late_s**2 - 1.0) < MEAN_BAND
 
 
-def max_filter_delay(residual: Float64[np.ndarray, "n 3"], samples: Float64[np.ndarray, "m 3"]) -> float:
+def max_filter_delay(residual: Vectors, samples: Float64[np.ndarray, "m 3"]) -> float:
     """Most delay (sample periods) of a filter that the noise shows; 0 for white noise.
 
     Quartiles of short segments are those between two impacts.
@@ -78,7 +76,7 @@ def max_filter_delay(residual: Float64[np.ndarray, "n 3"], samples: Float64[np.n
 
 def bandwidth_faults(
     sensor: Sensor,
-    sims: tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "m 3"]],
+    sims: tuple[Vectors, Float64[np.ndarray, "m 3"]],
     sim_hz: float,
     real: Float64[np.ndarray, "k 3"],
     real_hz: float,
@@ -95,7 +93,7 @@ def bandwidth_faults(
         yield found("bandwidth_absent", sensor, left=Estimate(middle * near, 0.1 * middle * near, "-"))
 
 
-def _left(x: Float64[np.ndarray, "n 3"], rate_hz: float, nyquist_hz: float) -> tuple[float, float]:
+def _left(x: Vectors, rate_hz: float, nyquist_hz: float) -> tuple[float, float]:
     """Power that is left from band to band, towards a Nyquist frequency, in the calm quarter of a log."""
     f_hz, _, parts = spectrogram(x, rate_hz, window="hann", nperseg=min(SEGMENT, len(x)), axis=0)
     loud = parts[f_hz > BANDS[0][0] * nyquist_hz].sum(axis=0)

@@ -21,8 +21,8 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from imutool.array_types import Float64
-from imutool.diagnosis.audit.axes import Hypotheses, Matrix, Vectors
+from imutool.array_types import Float64, Rows6, Vectors
+from imutool.diagnosis.audit.axes import Hypotheses, Matrix
 from imutool.diagnosis.result import Estimate
 from imutool.errors import DataError
 from imutool.inertial.kinematics import G_W
@@ -90,7 +90,7 @@ class KinematicFit:
     estimates: dict[str, Estimate]
     frames: tuple[str, str]
     axes: tuple[Matrix, Matrix]
-    residual: Float64[np.ndarray, "n 6"]
+    residual: Rows6
 
 
 def kinematics(log: Recording) -> Kinematics:

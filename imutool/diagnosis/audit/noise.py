@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import spectrogram
 from scipy.stats import gamma
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6, Vectors
 from imutool.diagnosis.audit.bandwidth import bandwidth_faults, max_filter_delay
 from imutool.diagnosis.audit.faults import FaultFound, found
 from imutool.diagnosis.audit.spectral_lines import HANN, SpectralLine
@@ -22,7 +22,6 @@ from imutool.recording import Imu
 from imutool.recording.columns import true_ranges
 from imutool.units import SENSORS, UNITS, Sensor
 
-Six = Float64[np.ndarray, "n 6"]
 Column = Float64[np.ndarray, " k"]
 ABSENT = 0.02  # of the expected noise: less is none
 ALIKE = 1.35  # factor between two densities that are one: a data sheet is typical
@@ -52,7 +51,7 @@ class Expected:
     density: Float64[np.ndarray, "6"]
     walk: Float64[np.ndarray, "6"]
     rate_hz: float | None = None
-    samples: Six | None = None
+    samples: Rows6 | None = None
     lsb: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
 
     @classmethod
@@ -121,7 +120,7 @@ def _between_impacts(x: Float64[np.ndarray, "n k"], size: int) -> Column:
 
 
 def noise_faults(
-    imu: Imu, residual: Six, expected: list[Expected], lines: Sequence[SpectralLine] = ()
+    imu: Imu, residual: Rows6, expected: list[Expected], lines: Sequence[SpectralLine] = ()
 ) -> tuple[list[FaultFound], list[SpectralLine]]:
     """Faults of the noise, and lines of unknown cause.
 
@@ -183,7 +182,7 @@ def _without_digits(noise: float, lsb: float) -> float:
 
 
 def _walk(
-    sensor: Sensor, residual: Float64[np.ndarray, "n 3"], rate_hz: float, own: float, walk: Float64[np.ndarray, "3"]
+    sensor: Sensor, residual: Vectors, rate_hz: float, own: float, walk: Float64[np.ndarray, "3"]
 ) -> Iterator[FaultFound]:
     """A bias that never walks: the slow parts of the residual are too small for the expected walk.
 
@@ -207,14 +206,14 @@ def _walk(
         yield found("bias_never_walks", sensor, expected_walk=Estimate(density, 0.0, f"{UNITS[sensor]}/s/√Hz"))
 
 
-def _clipping(sensor: Sensor, sim: Float64[np.ndarray, "n 3"], real: Float64[np.ndarray, "m 3"]) -> Iterator[FaultFound]:
+def _clipping(sensor: Sensor, sim: Vectors, real: Float64[np.ndarray, "m 3"]) -> Iterator[FaultFound]:
     """Clipping that the recording has and the simulation lacks."""
     limit = limits(np.tile(real, 2)).get(sensor)
     if limit is not None and np.abs(sim).max() > OVER_LIMIT * limit:
         yield found("clipping_absent", sensor, limit=Estimate(limit, 0.0, UNITS[sensor]))
 
 
-def _digits(sensor: Sensor, sim: Float64[np.ndarray, "n 3"], real: Float64[np.ndarray, "m 3"]) -> Iterator[FaultFound]:
+def _digits(sensor: Sensor, sim: Vectors, real: Float64[np.ndarray, "m 3"]) -> Iterator[FaultFound]:
     """Digits that the recording has and the simulation lacks."""
     steps = [grid(column) for column in real.T]
     lsb = float(np.median(steps))
@@ -222,7 +221,7 @@ def _digits(sensor: Sensor, sim: Float64[np.ndarray, "n 3"], real: Float64[np.nd
         yield found("digits_absent", sensor, lsb=Estimate(lsb, 1e-3 * lsb, UNITS[sensor]))
 
 
-def _repeated(samples: Six) -> Iterator[FaultFound]:
+def _repeated(samples: Rows6) -> Iterator[FaultFound]:
     """Samples held for some periods; runs of `REST` are the rest of a body without noise."""
     equal = (np.diff(samples, axis=0) == 0.0).all(axis=1)
     for start, end in true_ranges(equal):

@@ -15,12 +15,11 @@ from scipy.signal import spectrogram
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Bool, Float64, Rows6, Vectors
 from imutool.inertial.kinematics import G_W
 from imutool.recording import Poses
 from imutool.units import SENSORS, Sensor
 
-Six = Float64[np.ndarray, "n 6"]
 Column = Float64[np.ndarray, " f"]
 Cause = Literal["motion", "sensor", "unknown"]
 P_VALUE = 1e-9
@@ -74,7 +73,7 @@ class Shown(NamedTuple):
 
 
 def spectral_lines(
-    samples: Six, residual: Float64[np.ndarray, "m 6"], rate_hz: float, shown: Float64[np.ndarray, "p 6"], poses_hz: float
+    samples: Rows6, residual: Float64[np.ndarray, "m 6"], rate_hz: float, shown: Float64[np.ndarray, "p 6"], poses_hz: float
 ) -> list[SpectralLine]:
     """Strongest line of each sensor with which the body does not move, or may not.
 
@@ -113,7 +112,7 @@ def _cause(f_hz: float, rate_hz: float, power: float, shown: Shown) -> Cause:
     return "sensor" if f_hz < KNOWN_SHARE * shown.rate_hz and expected > CLEARLY * power_shown else "unknown"
 
 
-def _spectrum(x: Float64[np.ndarray, "n 3"], rate_hz: float, size: int) -> Spectrum:
+def _spectrum(x: Vectors, rate_hz: float, size: int) -> Spectrum:
     f_hz, _, parts = spectrogram(x, rate_hz, window="hann", nperseg=size, noverlap=size // 2, axis=0)
     by_segment = parts.sum(axis=1)
     power = by_segment.mean(axis=1)
@@ -124,7 +123,7 @@ def _spectrum(x: Float64[np.ndarray, "n 3"], rate_hz: float, size: int) -> Spect
     return Spectrum(f_hz, power, ratio, np.asarray(certain), np.asarray(by_segment.std(axis=1) < STEADY * power))
 
 
-def by_differences(poses: Poses, arm: Float64[np.ndarray, "3"]) -> tuple[Six, float]:
+def by_differences(poses: Poses, arm: Float64[np.ndarray, "3"]) -> tuple[Rows6, float]:
     """Rate and specific force at a lever arm by differences of poses, and their rate (Hz)."""
     period_s = poses.period_s
     R_wb = Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True)

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.signal import butter, csd, sosfiltfilt, welch
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Bool, Float64, Rows6
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, expected
@@ -94,9 +94,7 @@ def _counting(pair: Pair, white: Whitener) -> WhitenedImu:
     return WhitenedImu(pair, white if pair.known is None else white.counting(pair.known))
 
 
-def _in_band(
-    pair: Pair, columns: Sequence[Float64[np.ndarray, "_ m"]], wide_misfit: Float64[np.ndarray, "n 6"], band: Band
-) -> Whitener:
+def _in_band(pair: Pair, columns: Sequence[Float64[np.ndarray, "_ m"]], wide_misfit: Rows6, band: Band) -> Whitener:
     """The noise of rows in a band, from the residual of a rich model there, whose columns are in it by axis."""
     misfit = band(wide_misfit)
     usable = pair.usable[:: band.every]
@@ -137,11 +135,11 @@ def noise_std(whiten: Whitener) -> Float64[np.ndarray, " k"]:
     return np.asarray(whiten.std * np.sqrt((1.0 / response).mean(axis=1)))
 
 
-def _left(pair: Pair, candidates: Sequence[Effect]) -> Float64[np.ndarray, "n 6"]:
+def _left(pair: Pair, candidates: Sequence[Effect]) -> Rows6:
     """Residual of a simulation's misfit after a fit of every linear effect."""
     linear: Chosen = tuple((effect, effect.null_value.astype(float)) for effect in candidates if effect.linear)
     forward = ForwardPass(pair, linear)
-    residual: Float64[np.ndarray, "n 6"] = pair.real - forward.expected
+    residual: Rows6 = pair.real - forward.expected
     columns: list[list[np.ndarray]] = [[np.ones(len(residual))] for _ in range(6)]
     for effect, _ in linear:
         for axis, _, row in forward.derivatives(effect):

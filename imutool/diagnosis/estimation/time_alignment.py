@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.cleaning.stamp_line import unrounded
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair, split
 from imutool.diagnosis.estimation.timestamps import without_jitter
@@ -272,7 +272,7 @@ def _refined(real: Imu, sim: Imu, lag_s: float, settings: AlignmentSettings) -> 
     return lag_s + off_s
 
 
-def _turning(t_ns: Times, x: Float64[np.ndarray, "n 3"], rate_hz: float) -> Float64[np.ndarray, " m"]:
+def _turning(t_ns: Times, x: Vectors, rate_hz: float) -> Float64[np.ndarray, " m"]:
     """Size of the angular rate, or of another vector, on an even clock."""
     size, t_s = np.linalg.norm(x - np.median(x, axis=0), axis=1), seconds(t_ns, int(t_ns[0]))
     return np.asarray(np.interp(np.arange(0.0, t_s[-1], 1.0 / rate_hz), t_s, size))

@@ -9,7 +9,7 @@ from scipy.ndimage import binary_dilation, median_filter
 from scipy.signal import savgol_filter
 from scipy.stats import binom, norm
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Bool, Float64, Rows6
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair
 from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.diagnosis.settings import TimestampSettings
@@ -153,7 +153,7 @@ def grid(x: Float64[np.ndarray, " n"], settings: TimestampSettings = DEFAULT.tim
     return step if float((off < 0.05).mean()) > settings.grid_share else 0.0
 
 
-def limits(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAULT.timestamps) -> dict[str, float]:
+def limits(real: Rows6, settings: TimestampSettings = DEFAULT.timestamps) -> dict[str, float]:
     """Limits of the converters: the largest readings of a side that recur to the last digit.
 
     By sensor; by axis (`gyro_x`) where another axis of the sensor reads more.
@@ -199,7 +199,7 @@ def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]
     return tuple(candidates)
 
 
-def clipped(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAULT.timestamps) -> Bool[np.ndarray, "n 6"]:
+def clipped(real: Rows6, settings: TimestampSettings = DEFAULT.timestamps) -> Bool[np.ndarray, "n 6"]:
     """Clipped samples of an axis, and their neighbours, which filters mix with them."""
     at = np.zeros(real.shape, bool)
     for key, limit in limits(real, settings).items():
@@ -208,7 +208,7 @@ def clipped(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFA
     return np.asarray(binary_dilation(at, np.ones((5, 1), bool))) if at.any() else at
 
 
-def stuck(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, "6"]:
+def stuck(real: Rows6) -> Bool[np.ndarray, "6"]:
     """Stuck axes, which read the same in every sample."""
     return np.asarray(np.ptp(real, axis=0) == 0.0)
 

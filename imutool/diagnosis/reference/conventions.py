@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Vectors
 from imutool.cleaning.rules.axes import TO_Z_UP
 from imutool.diagnosis.audit.axes import Hypotheses, Matrix
 from imutool.diagnosis.audit.motion import OTHER_UNIT
@@ -25,7 +25,6 @@ EXPLAINED = 0.03  # of the motion's squares: a convention leaves less, unless th
 EXPLAINED_AS_OTHER = 0.3  # likewise, if the other sensor shows the same axes: a large lever arm is left next to a convention
 UNLIKE = 0.1  # loss of correlation with the motion that another order of axes may bring: at rest no order correlates
 CONSTANT = 0.1  # of the squares of the specific force: a bias and a tilt leave less of them, a wrong convention most of gravity
-Readings = Float64[np.ndarray, "n 3"]
 
 
 def with_common_conventions(pairs: Sequence[Pair], of: str = "simulation") -> tuple[list[Pair], list[Finding]]:
@@ -77,7 +76,7 @@ class _Convention(NamedTuple):
         return self.factor, self.P if self.needed or (alike and other.needed) else np.eye(3)
 
 
-def _convention(sensor: Sensor, y: Readings, x: Readings) -> _Convention:
+def _convention(sensor: Sensor, y: Vectors, x: Vectors) -> _Convention:
     """Convention that the motion shows best; the same as the reference if gravity or the correlation contradicts it."""
     same = _Convention(1.0, np.eye(3), np.inf, needed=False)
     if len(y) == 0 or not y.any():
@@ -95,7 +94,7 @@ def _convention(sensor: Sensor, y: Readings, x: Readings) -> _Convention:
     return _Convention(factor, P, float(misfit.var(axis=0).sum()) / size, needed) if shown else same
 
 
-def _correlation(y: Readings, x: Readings) -> float:
+def _correlation(y: Vectors, x: Vectors) -> float:
     """Correlation of all axes together."""
     y, x = y - y.mean(axis=0), x - x.mean(axis=0)
     return float((y * x).sum() / max(np.sqrt((y**2).sum() * (x**2).sum()), np.finfo(np.float64).tiny))

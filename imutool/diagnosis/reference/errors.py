@@ -21,7 +21,7 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 from scipy.stats import chi2
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6, Vectors
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.whitening import WhitenedImu
@@ -81,7 +81,7 @@ def reference_errors(logs: Sequence[WhitenedImu]) -> tuple[list[Finding], tuple[
     return [finding], places
 
 
-def _white_misfit(log: WhitenedImu) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 6"]]:
+def _white_misfit(log: WhitenedImu) -> tuple[Float64[np.ndarray, " n"], Rows6]:
     """Times of a log's rows, and white residuals of no effect without their constants."""
     rows = log.rows("all")
     white, constant = log.whiten(log.pair.real - expected(log.pair, ()))[rows], log.constants[rows]
@@ -167,7 +167,7 @@ def _sharpened(motion: IdealMotion, theta: Theta) -> IdealMotion:
     return replace(motion, gyro=gyro, accel=accel)
 
 
-def _less_curvature(x: Float64[np.ndarray, "n 3"], weight: float, rate_hz: float) -> Float64[np.ndarray, "n 3"]:
+def _less_curvature(x: Vectors, weight: float, rate_hz: float) -> Vectors:
     """Columns less their second derivative times a weight, each column one piece of memory as before."""
     out = x.copy(order="K")
     second = x[2:] - 2.0 * x[1:-1]
@@ -235,7 +235,7 @@ def _slow_means(log: WhitenedImu, chosen: Chosen) -> tuple[Float64[np.ndarray, "
     usable = np.asarray(pair.usable.all(axis=1), dtype=float)[: blocks * count]
     used = np.flatnonzero(usable.reshape(blocks, count).mean(axis=1) > MOSTLY)
 
-    def means(x: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "b 6"]:
+    def means(x: Rows6) -> Float64[np.ndarray, "b 6"]:
         return np.asarray(x[: blocks * count].reshape(blocks, count, 6).mean(axis=1)[used])
 
     return means(pair.real - model), means(model)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.fft import dct, idct
 from scipy.spatial.transform import Rotation
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Rows6, Vectors
 from imutool.cleaning.rules.axes import TO_Z_UP
 from imutool.cleaning.truth import truth_of
 from imutool.diagnosis.audit.spectral_lines import by_differences
@@ -76,7 +76,7 @@ def band_hz(stretch: Stretch, settings: ReferenceSettings) -> float:
     return max(settings.band_share * min(stretch.cutoff_hz), settings.min_band_hz)
 
 
-def is_in_raw_poses(pair: Pair, line: Float64[np.ndarray, "n 6"], f_hz: float) -> bool:
+def is_in_raw_poses(pair: Pair, line: Rows6, f_hz: float) -> bool:
     """Whether the poses have a spectral line before smoothing: it is motion of the body.
 
     They have none above half of their rate.
@@ -144,7 +144,7 @@ def _with_lost_motion(ideal: IdealMotion, cutoffs_hz: tuple[float, float], share
     f_hz = np.arange(n)[:, None] * ideal.rate_hz / (2.0 * n)
     of_position, of_rotation = (np.minimum(f_hz / hz, share) ** 6 for hz in cutoffs_hz)
 
-    def lost(x: Float64[np.ndarray, "n 3"], part: Float64[np.ndarray, "n 1"]) -> Float64[np.ndarray, "n 3"]:
+    def lost(x: Vectors, part: Float64[np.ndarray, "n 1"]) -> Vectors:
         return np.asarray(idct(dct(x, axis=0) * part, axis=0))
 
     force, turn = to_world(ideal.accel), lost(to_world(ideal.gyro), of_rotation)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Bool, Float64, Rows6
 from imutool.cleaning.stamp_line import batch_words, read_stamps, restamped
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.timestamps import JITTER, even, uneven
@@ -43,7 +43,7 @@ def new_samples(recording: Recording) -> Recording:
     return replace(recording, imu=recording.imu.rows(~repeated))
 
 
-def repeats(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
+def repeats(real: Rows6) -> Bool[np.ndarray, " n"]:
     """Samples that repeat the one before on every axis.
 
     The axes seldom read the same twice otherwise. A driver that missed a sample may send the last one again. Digits that are
@@ -55,7 +55,7 @@ def repeats(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
     return np.asarray(repeated & bool(by_chance.max() < SELDOM and repeated.mean() < MOSTLY_NEW))
 
 
-def filled(stamp_s: Float64[np.ndarray, " n"], real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
+def filled(stamp_s: Float64[np.ndarray, " n"], real: Rows6) -> Bool[np.ndarray, " n"]:
     """Samples on a line between their neighbours on every axis, as where a gap was filled.
 
     It cuts the peaks of a motion, which looks like a scale. No axis lies on a line elsewhere, unless its digits are coarse.

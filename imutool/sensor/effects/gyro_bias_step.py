@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.sensor.effect import ONCE_MORE, Effect, Parameter, Stage, Theta, each_axis, residual
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import Sensor
@@ -72,7 +72,7 @@ def followed(ideal: SensorSamples) -> Float64[np.ndarray, "n q"]:
 
 def likeliest_onset(
     t_s: Float64[np.ndarray, " n"],
-    error: Float64[np.ndarray, "n 3"],
+    error: Vectors,
     beside: Float64[np.ndarray, "n q"],
     before: int = 0,
     setting_in: Sequence[Float64[np.ndarray, "_ a"]] = (),
@@ -103,7 +103,7 @@ def orthonormal(beside: Float64[np.ndarray, "n q"]) -> Float64[np.ndarray, "n r"
 
 def _largest(
     t_s: Float64[np.ndarray, " n"],
-    error: Float64[np.ndarray, "n 3"],
+    error: Vectors,
     basis: Float64[np.ndarray, "n q"],
     columns: Float64[np.ndarray, "n a m"],
 ) -> tuple[Theta, int]:

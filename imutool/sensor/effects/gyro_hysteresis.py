@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Vectors
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, residual
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import Sensor
@@ -46,15 +46,13 @@ def hysteresis(sensor: Sensor, symbol: str, unit: str, plausible: float, observa
     )
 
 
-def error_and_ideal(
-    sensor: Sensor, motion: IdealMotion, samples: SensorSamples
-) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+def error_and_ideal(sensor: Sensor, motion: IdealMotion, samples: SensorSamples) -> tuple[Vectors, Vectors]:
     """Error of the readings without its mean, and the ideal readings."""
     error = residual(motion, samples)[0 if sensor == "gyro" else 1]
     return error - error.mean(axis=0), getattr(motion.sample(samples.stamp_s, samples.stamp_s), sensor)
 
 
-def play(x: Float64[np.ndarray, "n 3"], width: float) -> Float64[np.ndarray, "n 3"]:
+def play(x: Vectors, width: float) -> Vectors:
     """Play of columns: from turn to turn of a column, it is what the last turn left, clipped.
 
     Two clips in a row are one clip, so that those of all turns take as many steps as their number has binary digits.

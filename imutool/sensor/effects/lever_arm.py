@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Vectors
 from imutool.inertial.kinematics import lever_acceleration
 from imutool.sensor.effect import CompiledEffect, Effect, Stage, Theta, each_axis
 from imutool.sensor.samples import IdealMotion
@@ -26,7 +26,7 @@ def _fast(r_b: Theta) -> CompiledEffect:
     r = tuple(r_b.tolist())
     arms = (r, r, r)
 
-    def block(signals: Signals) -> Float64[np.ndarray, "n 3"]:
+    def block(signals: Signals) -> Vectors:
         return np.stack(lever_acceleration(signals.gyro.T, signals.alpha.T, arms), axis=1)
 
     def one(_: float, row: list[float]) -> Three:

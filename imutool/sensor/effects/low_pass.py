@@ -25,9 +25,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
-from imutool.array_types import Complex128, Float64
+from imutool.array_types import Complex128, Float64, Vectors
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.samples import IdealMotion, SensorSamples, Vectors
+from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import SENSORS, Sensor
 
 MAX = 0.4999  # cycles a sample of a digital filter: its gain is 0 at a half

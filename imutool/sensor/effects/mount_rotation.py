@@ -8,10 +8,10 @@ from functools import lru_cache, partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, residual
 from imutool.sensor.effects.gyro_bias_step import best_row, followed, from_on, orthonormal
-from imutool.sensor.samples import IdealMotion, SensorSamples, Vectors
+from imutool.sensor.samples import IdealMotion, SensorSamples
 
 NOTHING_MOVES = 1e-9  # rad/s or m/s², below which a sensor says nothing
 NEAR_RAD = 0.3  # up to which a fit that begins without a rotation finds it

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Vectors
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import IdealMotion, SensorSamples
 
@@ -20,7 +20,7 @@ def _forward(samples: SensorSamples, lsb: Theta) -> SensorSamples:
     )
 
 
-def _smallest_step(values: Float64[np.ndarray, "n 3"]) -> float:
+def _smallest_step(values: Vectors) -> float:
     """Smallest step between distinct values of an axis; negligible where every axis is constant."""
     minimum = max(SAME * float(np.abs(values).max()), np.finfo(np.float64).tiny)
     steps = np.diff(np.sort(values, axis=0), axis=0)

@@ -11,7 +11,7 @@ from bisect import bisect_right
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.sensor.effect import CompiledEffect, Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import SensorSamples
 from imutool.sensor.signals import GYRO, GYRO_SLOW, Signals
@@ -33,13 +33,13 @@ def _values(theta: Theta) -> Float64[np.ndarray, "2 3 k"]:
     return values
 
 
-def _curves(signals: Signals, values: Float64[np.ndarray, "2 3 k"]) -> Float64[np.ndarray, "n 3"]:
+def _curves(signals: Signals, values: Float64[np.ndarray, "2 3 k"]) -> Vectors:
     columns = zip((*signals.gyro.T, *signals.gyro_slow.T), values.reshape(6, -1), strict=True)
     both = [np.interp(x, KNOTS_RAD_S, value) for x, value in columns]
     return np.stack([a + b for a, b in zip(both[:3], both[3:], strict=True)], axis=1)
 
 
-def hats(x: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n q"]:
+def hats(x: Vectors) -> Float64[np.ndarray, "n q"]:
     """Tent functions of all knots but zero, axis by axis; constant beyond the last knot."""
     inside = np.clip(x, KNOTS_RAD_S[0], KNOTS_RAD_S[-1])
     j = np.clip(np.searchsorted(KNOTS_RAD_S, inside, side="right") - 1, 0, len(KNOTS_RAD_S) - 2)

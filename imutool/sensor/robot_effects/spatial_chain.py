@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Vectors
 from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.robot_effects.signal_samples import State
 
@@ -24,7 +24,7 @@ DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])  # of an axis where all ang
 STARTS, SEED = 10, 0
 EVALUATIONS = 30  # of a residual, with its derivatives, at most
 MIN_MOMENT = 0.02  # of the tip against gravity, over the arm's size, that shows the links' lengths
-Axes = Float64[np.ndarray, "n 3"]
+Axes = Vectors
 APART = 0.2  # of a direction that no place on the last link has
 UNSURE = 1e-3  # square of the sine from which on a product of inertia hides a length
 Cost = Callable[[Axes], float]
