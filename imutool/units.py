@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Literal
 
 Sensor = Literal["gyro", "accel"]
 Three = tuple[float, float, float]  # one number an axis
 SENSORS: tuple[Sensor, Sensor] = ("gyro", "accel")
+COLUMNS: Mapping[str, slice] = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of six: a vector, or the columns of both sensors
 AXES = ("x", "y", "z")
 FULL_SCALE_RAD_S = 35.0  # 2000 degrees a second, the widest range of common MEMS gyros
 MAX_RATE_RAD_S = 1e4  # no gyro measures more

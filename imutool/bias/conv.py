@@ -25,11 +25,11 @@ import msgspec
 import numpy as np
 
 from imutool.array_types import Float64, Rows6, Vectors
-from imutool.bias.model import COLUMNS, Array, BiasModel, Shapes, Stream, Vector6, matrices
+from imutool.bias.model import Array, BiasModel, Shapes, Stream, Vector6, matrices
 from imutool.bias.neural_stream import gelu
 from imutool.config import Settings
 from imutool.errors import ConfigError
-from imutool.units import SENSORS, Sensor
+from imutool.units import COLUMNS, SENSORS, Sensor
 
 Positive = Annotated[float, msgspec.Meta(ge=1e-9, le=1e9)]
 Channels = Annotated[tuple[Annotated[int, msgspec.Meta(ge=1, le=512)], ...], msgspec.Meta(min_length=1, max_length=8)]

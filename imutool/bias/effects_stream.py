@@ -7,9 +7,10 @@ import math
 import numpy as np
 
 from imutool.array_types import Float64, Rows6, Vectors
-from imutool.bias.model import COLUMNS, DriftStream, Stream, Vector6
+from imutool.bias.model import DriftStream, Stream, Vector6
 from imutool.sensor.linear_form import CompiledEffects
 from imutool.sensor.signals import Load, SignalFilter
+from imutool.units import COLUMNS
 
 
 class EffectsStream:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from imutool.array_types import Float64, Int64, Rows6, Vectors
-from imutool.bias.model import COLUMNS, BiasModel, Covariances, Vector6
+from imutool.bias.model import BiasModel, Covariances, Vector6
 from imutool.bias.temperature import TemperatureFilter, celsius_of, channel_of, holding, scale_of
 from imutool.errors import ModelError
 from imutool.inertial.stationary import CALM, white_noise
@@ -17,6 +17,7 @@ from imutool.mcap_io.temperature import EVERY_NS, is_temperature, thinned
 from imutool.recording import Imu, Scalars
 from imutool.recording.columns import quantile
 from imutool.sensor.signals import TEMPERATURE_TERMS
+from imutool.units import COLUMNS
 
 RATE_TOLERANCE = 0.05  # a real rate differs from its nominal one by a few per mille (BMI160: 199.4 for 200)
 MAX_FACTOR = 4.5  # between the rates of training and log: four, as means of four samples were tried, and some drift

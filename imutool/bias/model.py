@@ -23,7 +23,6 @@ from imutool.array_types import Float64, Int64, Rows6, Vectors
 from imutool.config import Settings
 from imutool.units import SENSORS, Sensor
 
-COLUMNS = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of a vector of six
 MAX_BIAS = 1e6  # rad/s and m/s²: more is no bias
 STATISTICS = ("prior_mean", "prior_std", "truth_std", "rest_std", "walk_std", "noise_std")
 GAP_S = 1.0  # a longer step of the stamps begins a new stretch: filters of the samples start anew, and no drift is integrated

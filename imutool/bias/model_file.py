@@ -102,12 +102,7 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str
 
 
 def _refuse_size(path: Path, maximum: int) -> None:
-    """Refuse a path that is not a regular file, or is larger than `maximum` bytes; reading a pipe would block.
-
-    Raises:
-        ModelError: too large, or not a regular file.
-        OSError: no such file.
-    """
+    """Refuse a path that is not a regular file, or is larger than `maximum` bytes; reading a pipe would block."""
     size = path.stat().st_size
     if not path.is_file():
         raise ModelError(
@@ -263,11 +258,7 @@ class _Header(NamedTuple):
 
 
 def _header(raw: Mapping[str, str], path: Path) -> _Header:
-    """Validated header of a model file from an unknown source.
-
-    Raises:
-        ModelError: an entry is missing, is not JSON, or has another type.
-    """
+    """Validated header of a model file from an unknown source."""
     try:
         if len(raw["settings"]) > MAX_SETTINGS:
             raise ValueError(f"{len(raw['settings'])} characters of settings, at most {MAX_SETTINGS}")

@@ -35,13 +35,13 @@ import numpy as np
 
 from imutool.array_types import Float64, Rows6, Vectors
 from imutool.bias.effects_stream import EffectsStream
-from imutool.bias.model import COLUMNS, Array, BiasModel, DriftStream, Shapes, Vector6
+from imutool.bias.model import Array, BiasModel, DriftStream, Shapes, Vector6
 from imutool.bias.neural_stream import HALF_ROOT, Curves, CurveWeights, NeuralStream, erf, gelu
 from imutool.bias.temperature import columns_of, forms, samples_alone
 from imutool.config import Settings
 from imutool.errors import ConfigError
 from imutool.sensor.linear_form import compiled
-from imutool.units import SENSORS, Sensor
+from imutool.units import COLUMNS, SENSORS, Sensor
 
 SLOW_S, DRIFT_FILTER_S = 0.1, 0.5  # filter time constants of the inputs of curve and drift
 NEAR_ZERO = 10.0

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from imutool.array_types import Float64, Rows6, Vectors
-from imutool.bias.model import COLUMNS, Array, Vector6
+from imutool.bias.model import Array, Vector6
 from imutool.sensor.signals import low_pass
-from imutool.units import Sensor
+from imutool.units import COLUMNS, Sensor
 
 ROWS = 64  # per product: they fit in the cache, and BLAS starts no threads for such a small product
 HALF_ROOT = math.sqrt(0.5)

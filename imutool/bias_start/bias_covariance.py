@@ -24,13 +24,13 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Float64, Int64, Rows6, Vectors
-from imutool.bias.model import COLUMNS, BiasEstimate, BiasModel, Covariances
+from imutool.bias.model import BiasEstimate, BiasModel, Covariances
 from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.stretches import measured
 from imutool.geometry import quaternion
 from imutool.inertial.preintegration import hat
 from imutool.recording import Imu, Poses, seconds
-from imutool.units import SENSORS, Sensor
+from imutool.units import COLUMNS, SENSORS, Sensor
 
 PASSED_AT_ONCE = 1 << 12  # samples between windows: roots take some hundred bytes each
 Roots = Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]

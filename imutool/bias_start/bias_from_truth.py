@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from imutool.array_types import Bool, Float64, Int64, Rows6, Vectors
-from imutool.bias.model import COLUMNS, Array, BiasModel, Vector6
+from imutool.bias.model import Array, BiasModel, Vector6
 from imutool.bias_start.bias_at_rest import MAX_UNKNOWN, UNUSUAL, refuted_stops, rest_differences
 from imutool.bias_start.initial_bias import (
     MIN_STD,
@@ -31,6 +31,7 @@ from imutool.inertial.strapdown import GRAVITY_W, with_velocity
 from imutool.log_info.convention_report import check_start_poses
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
 from imutool.recording.columns import median
+from imutool.units import COLUMNS
 
 TRUTH_S = 15.0  # length of truth for a start: of 3, 5, 8, 10 and 15 s the best on training logs left out in turn
 MIN_TRUTH_S = 1.0

@@ -217,11 +217,7 @@ class OnlineDebiaser:
         return self._covariance.copy()
 
     def _check_first(self, stamp_ns: int, accel: Float64[np.ndarray, "3"]) -> None:
-        """Check rate and gravity once, by the first samples; they may come in batches, or a moment late.
-
-        Raises:
-            DataError, ModelError: as in a log.
-        """
+        """Check rate and gravity once, by the first samples; they may come in batches, or a moment late."""
         assert self._first is not None
         self._first.append((stamp_ns, accel))
         if len(self._first) < CHECKED:

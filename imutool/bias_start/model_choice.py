@@ -255,11 +255,7 @@ def _first_minute(log: Log, topic: str, init: str, survey: Survey | None) -> Rec
 
 
 def _samples(log: Log, topic: str, survey: Survey | None, end_ns: int | None) -> Imu:
-    """Samples of one IMU; with a survey they are cleaned, and `end_ns` refers to stamps.
-
-    Raises:
-        LogError: fewer than two samples, or none that a recording accepts.
-    """
+    """Samples of one IMU; with a survey they are cleaned, and `end_ns` refers to stamps."""
     batches = list(_imu_batches(log, topic, survey, end_ns))
     count = sum(len(t_ns) for _, t_ns in batches)
     if count < 2:

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Bool, Float64
-from imutool.bias.model import COLUMNS, Vector6
+from imutool.bias.model import Vector6
 from imutool.cleaning.likelihood import axis_names, signed_permutations
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State
+from imutool.units import COLUMNS
 
 MAX_CHANGE = np.array([0.05] * 3 + [0.7] * 3)  # rad/s and m/s²: no switching-on changes one sensor's bias by more
 MAX_DEVIATIONS = 5.0  # between a log's bias and the prior; training logs up to 3.1, other sensors from 6.7 on
@@ -143,7 +144,7 @@ def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, max_left: floa
 
 def other_bias(difference: Vector6, deviations: Vector6, maximum: Vector6) -> Iterator[str]:
     """Sentences on biases that differ from a prior's by more deviations than a maximum."""
-    for sensor, unit, columns in (("gyro", "rad/s", slice(0, 3)), ("accelerometer", "m/s²", slice(3, 6))):
+    for sensor, unit, columns in (("gyro", "rad/s", COLUMNS["gyro"]), ("accelerometer", "m/s²", COLUMNS["accel"])):
         axis = int(np.argmax(deviations[columns])) + columns.start
         if deviations[axis] > maximum[axis]:
             yield (
@@ -156,7 +157,7 @@ def contradicted_start(rest: Vector6, std: Vector6, shown: Vector6, shown_std: V
     """Sentences on a start that contradicts a log's bias, and whether no correction is nearer."""
     off, total = np.abs(rest - shown), np.sqrt(std**2 + shown_std**2)
     sentences = []
-    for sensor, unit, columns in (("gyro", "rad/s", slice(0, 3)), ("accelerometer", "m/s²", slice(3, 6))):
+    for sensor, unit, columns in (("gyro", "rad/s", COLUMNS["gyro"]), ("accelerometer", "m/s²", COLUMNS["accel"])):
         axis = int(np.argmax(off[columns] / total[columns])) + columns.start
         if off[axis] > MAX_DEVIATIONS * total[axis]:
             seen = f"{shown[axis]:+.2g} ± {shown_std[axis]:.1g} {unit}"

@@ -24,7 +24,7 @@ from imutool.diagnosis.result import ClosedLoop, Compared, Diagnosis
 from imutool.diagnosis.to_sensor_files import NO_EFFECT
 from imutool.diagnosis.wording.quantity import symbol
 from imutool.errors import ConfigError, ImutoolError
-from imutool.units import ASCII_UNITS, SENSORS
+from imutool.units import ASCII_UNITS, COLUMNS, SENSORS
 
 CLOSED_LOG = "closed.mcap"
 WINDOW_S = 5.0  # over which samples are integrated
@@ -153,8 +153,8 @@ def _shared(first: Diagnosis, second: Diagnosis) -> list[_Stretch]:
 
 def _compared(stretches: Sequence[_Stretch]) -> Iterator[Compared]:
     """Figures of the expected samples over all stretches."""
-    for k, sensor in enumerate(SENSORS):
-        part, unit = slice(3 * k, 3 * k + 3), ASCII_UNITS[sensor]
+    for sensor, part in COLUMNS.items():
+        unit = ASCII_UNITS[sensor]
         misfits = [np.concatenate(all_of) for all_of in zip(*(stretch.misfits(part) for stretch in stretches), strict=True)]
         yield Compared(f"{sensor} rms", _rms(misfits[0]), _rms(misfits[1]), unit)
         bands = [_by_band([(stretch.t_s, stretch.misfits(part)[k]) for stretch in stretches]) for k in range(2)]

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS, Pair
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, free
 from imutool.diagnosis.estimation.noise_estimate import axis_squares
@@ -25,7 +25,7 @@ from imutool.diagnosis.result import Curve, Estimate, Finding
 from imutool.diagnosis.wording.quantity import grouped, stated_parameters
 from imutool.sensor import catalogue
 from imutool.sensor.effects.gyro_scale import SCALES
-from imutool.units import AXES
+from imutool.units import AXES, COLUMNS
 
 ALIKE_STD = 4.5  # joint deviations: chance exceeds them in 0.5 % (Student's t of ten blocks, the largest of nine numbers)
 ALIKE_SHARE = (
@@ -72,7 +72,7 @@ def is_of_digits(finding: Finding, digits: Finding) -> bool:
 
 def is_of_simulation(digits: Finding, pairs: Sequence[Pair]) -> bool:
     """Whether the simulation has the digits of the recording, too: they set neither apart."""
-    lsb = {f"{name}_lsb": float(np.median([pair.sim_lsb[part] for pair in pairs])) for name, part in IMU_SIGNALS.items()}
+    lsb = {f"{name}_lsb": float(np.median([pair.sim_lsb[part] for pair in pairs])) for name, part in COLUMNS.items()}
     return all(abs(lsb[name] - own.value) <= ALIKE_SHARE * own.value for name, own in digits.parameters.items())
 
 

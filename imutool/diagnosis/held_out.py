@@ -264,11 +264,7 @@ def _read(pair: Pair, ideals: Sequence[IdealMotion], acting: Acting) -> Rows6:
 
 
 def _refuse_unlike(log: WhitenedImu, given: Rows6, plain: Rows6, sim: Recording) -> None:
-    """Refuse poses so coarse or noisy that they give another simulation than the given one.
-
-    Raises:
-        DataError: so it is here.
-    """
+    """Refuse poses so coarse or noisy that they give another simulation than the given one."""
     rows, off = log.pair.held_out[:: log.whiten.every], given - plain
     if log.whiten.band is not None:
         off = log.whiten.band(off)

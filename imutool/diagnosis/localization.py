@@ -17,10 +17,10 @@ from scipy.ndimage import uniform_filter1d
 from scipy.stats import chi2, mannwhitneyu
 
 from imutool.array_types import Bool, Float64, Int64
-from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS, AlignedLog, Pair, Variables
+from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair, Variables
 from imutool.diagnosis.result import Extent, Finding, Located
 from imutool.diagnosis.settings import LocalizationSettings
-from imutool.units import AXES, SENSORS
+from imutool.units import AXES, COLUMNS
 
 NONE, ALIKE = 0.01, 1e-6  # share of the samples that differ by less than this of the noise, as where there is no misfit
 CALM_SHARE = 0.25  # of the seconds, that a misfit which comes and goes leaves alone
@@ -37,7 +37,7 @@ class Misfit(NamedTuple):
     t_s: Float64[np.ndarray, " n"]
     samples: Float64[np.ndarray, "n k"]
     noise: Float64[np.ndarray, " k"]  # standard deviation of a sample, by column
-    signals: Mapping[str, slice] = IMU_SIGNALS  # columns by signal; the axes of a signal of three are named
+    signals: Mapping[str, slice] = COLUMNS  # columns by signal; the axes of a signal of three are named
     averaged: Sequence[int] = ()  # samples of running means, the longest first
 
 
@@ -113,8 +113,8 @@ def _converter_output(samples: Float64[np.ndarray, "n k"], findings: Sequence[Fi
     """Clipped and rounded as the findings say."""
     out = samples.copy()
     values = {name: estimate.value for finding in findings for name, estimate in finding.parameters.items()}
-    for k, sensor in enumerate(SENSORS):
-        part, limit, lsb = slice(3 * k, 3 * k + 3), values.get(f"{sensor}_limit"), values.get(f"{sensor}_lsb")
+    for sensor, part in COLUMNS.items():
+        limit, lsb = values.get(f"{sensor}_limit"), values.get(f"{sensor}_lsb")
         own = [values.get(f"{sensor}_limit_{axis}", np.inf if limit is None else limit) for axis in AXES]
         if np.isfinite(own).any():  # else the columns may be those of another signal
             out[:, part] = np.clip(out[:, part], -np.array(own), own)

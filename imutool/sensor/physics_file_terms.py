@@ -140,11 +140,7 @@ def product(label: str, signal: Sensor, text: str, value: Sequence[float]) -> Ef
 
 
 def _channel(samples: SensorSamples, name: str) -> Float64[np.ndarray, " n"]:
-    """A channel of the log.
-
-    Raises:
-        DataError: the log has no channel of that name.
-    """
+    """A channel of the log."""
     if name not in samples.channels:
         listed = ", ".join(sorted(samples.channels)) or "(none)"
         expected = f"one of the log's channels: {listed}"

@@ -65,11 +65,7 @@ class Sampler:
         return self._values.changed(self._coefficients.changed(x, None, _coefficients), instants, weights.__matmul__)
 
     def _at(self, t_s: Times, taken_s: Float64[np.ndarray, " m"]) -> Instants:
-        """Clock, instants, and matrix from coefficients to values, or the rows of the clock's own instants.
-
-        Raises:
-            DataError: a clock that is not even.
-        """
+        """Clock, instants, and matrix from coefficients to values, or the rows of the clock's own instants."""
         for last in self._instants:
             if all(a is b or np.array_equal(a, b) for a, b in zip(last[:2], (t_s, taken_s), strict=True)):
                 return last

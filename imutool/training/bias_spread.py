@@ -14,7 +14,7 @@ from scipy.special import chdtri
 from torch import Tensor
 
 from imutool.array_types import Float, Float64
-from imutool.bias.model import COLUMNS, Session, Vector6
+from imutool.bias.model import Session, Vector6
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.networks.threads import of_each
 from imutool.bias_start.bias_at_rest import rest_differences
@@ -27,7 +27,7 @@ from imutool.recording import nanoseconds
 from imutool.training.calibration import closed_form
 from imutool.training.calibration.log_scatter import NUISANCE_STD
 from imutool.training.training_windows import Pool, corrected
-from imutool.units import SENSORS, Sensor
+from imutool.units import COLUMNS, SENSORS, Sensor
 
 MAD_TO_STD = 1.4826
 TURN_ON_STD = {"gyro": 5e-3, "accel": 0.1}  # of a switching-on: ADIS16448 2e-3 over four months, BMI160 up to 5e-2 (data sheet)

@@ -13,7 +13,7 @@ import torch
 
 from imutool.array_types import Float
 from imutool.bias.hybrid import Config
-from imutool.bias.model import COLUMNS, BiasModel
+from imutool.bias.model import BiasModel
 from imutool.bias.networks import hybrid, static
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.temperature import temperature_tensors
@@ -30,7 +30,7 @@ from imutool.training.calibration.shared_parameters import gain_of
 from imutool.training.log_signals import effects_turned_alike
 from imutool.training.settings import LINEAR, TrainSettings
 from imutool.training.training_windows import Pool, without_motion
-from imutool.units import Sensor
+from imutool.units import COLUMNS, Sensor
 
 CANDIDATES = ("constant", "linear", "effects")  # from the simplest
 PARTS_GAIN = 0.3  # of the loss: false effects take up to 0.21 off parts of one log of EuRoC, FETCH's curve 0.6 and more

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from imutool.array_types import Float, Int
-from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.networks.threads import of_each
 from imutool.errors import DataError
@@ -17,7 +16,7 @@ from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.calibration import closed_form
 from imutool.training.objectives.objective import BATCH_SAMPLES, error
 from imutool.training.training_windows import Pool, corrected, sensors_up_to
-from imutool.units import Sensor
+from imutool.units import COLUMNS, Sensor
 
 LONGEST_S = {"gyro": 20.0, "accel": 5.0}
 HOP_S = 1.0

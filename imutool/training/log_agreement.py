@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from imutool.array_types import Float64
-from imutool.bias.model import COLUMNS
 from imutool.bias_start.prior_width import MAX_CHANGE, turned_axes
 from imutool.errors import DataError
 from imutool.geometry import so3
@@ -21,7 +20,7 @@ from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.calibration.effect_selection import Calibration, parameter_columns
 from imutool.training.settings import LINEAR
 from imutool.training.training_windows import Pool
-from imutool.units import Sensor
+from imutool.units import COLUMNS, Sensor
 
 CONTRADICTS = 0.35  # of the error without a matrix, left by a log's own: 30 s without any matrix keep 0.43 at least
 MAX_LEFT = (

@@ -16,13 +16,12 @@ from torch import Tensor
 
 from imutool.array_types import Float64
 from imutool.bias.conv import BLOCK, Config
-from imutool.bias.model import COLUMNS
 from imutool.bias.model_file import load, save
 from imutool.bias.networks.conv import MIN_SCALE, Layer, Net, Network
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.neural_stream import gelu
 from imutool.errors import ConfigError
-from imutool.units import SENSORS, Sensor
+from imutool.units import COLUMNS, SENSORS, Sensor
 
 MakeSegment = Callable[..., Segment]
 CONTEXT = 510  # (7 - 1) * (1 + 4 + 16 + 64)

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from imutool.bias import hybrid
-from imutool.bias.model import COLUMNS, BiasModel, SampleStream
+from imutool.bias.model import BiasModel, SampleStream
 from imutool.bias.model_file import load, save
 from imutool.bias.networks import hybrid as network
 from imutool.bias.networks import neural_ode
@@ -25,7 +25,7 @@ from imutool.recording import Imu
 from imutool.sensor import catalogue
 from imutool.sensor.linear_form import compiled
 from imutool.sensor.signals import SignalFilter
-from imutool.units import SENSORS, Sensor
+from imutool.units import COLUMNS, SENSORS, Sensor
 
 MakeModel, MakeSegment = Callable[..., BiasNetwork], Callable[..., Segment]
 RATE_HZ = 200.0

@@ -8,12 +8,11 @@ import torch
 from support.switchings_on import Switchings, log
 
 from imutool.bias import linear
-from imutool.bias.model import COLUMNS
 from imutool.bias.networks.linear import Network
 from imutool.bias.networks.static import Network as StaticNetwork
 from imutool.training.calibration import closed_form
 from imutool.training.training_windows import Pool
-from imutool.units import SENSORS, Sensor
+from imutool.units import COLUMNS, SENSORS, Sensor
 
 SETS, LOGS = 8, 4  # sets of logs
 MIN = 0.4  # the size stated before the scatter counts, too, and is too large for poses with independent errors

@@ -12,7 +12,6 @@ import scipy.special
 import torch
 from torch import Tensor, nn
 
-from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.networks.neural_ode import Curve, Drift, Network
 from imutool.bias.networks.ode import HermitePath, integrate
@@ -22,7 +21,7 @@ from imutool.geometry import so3
 from imutool.inertial.windows import attitudes
 from imutool.recording import seconds
 from imutool.sensor.made_up_flight import flight
-from imutool.units import SENSORS, Sensor
+from imutool.units import COLUMNS, SENSORS, Sensor
 
 RATE_HZ = 200.0
 SECONDS = 12.0

@@ -14,10 +14,10 @@ from torch import Tensor, nn
 
 from imutool import registry
 from imutool.array_types import Float
-from imutool.bias.model import COLUMNS, STATISTICS, BiasModel
+from imutool.bias.model import STATISTICS, BiasModel
 from imutool.config import Settings
 from imutool.inertial.windows import end_attitude
-from imutool.units import SENSORS, Sensor
+from imutool.units import COLUMNS, SENSORS, Sensor
 
 
 @dataclass(frozen=True)

@@ -204,11 +204,7 @@ class _Solver:
         xi0: Float[Tensor, "*batch 3"],
         state0: Float[Tensor, "*batch m"],
     ) -> Float[Tensor, "n *batch k"]:
-        """States (xi, state) at the times, in the chart at R0.
-
-        Raises:
-            NumericsError: dopri5 could not keep its tolerance.
-        """
+        """States (xi, state) at the times, in the chart at R0."""
         local = times - times[0]
         options, backward = self._options(local)
         how: dict[str, Any] = {"rtol": self.rtol, "atol": self.atol, "options": options}

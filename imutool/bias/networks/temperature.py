@@ -10,13 +10,12 @@ import torch
 from torch import Tensor
 
 from imutool.array_types import Float64
-from imutool.bias.model import COLUMNS
 from imutool.bias.temperature import Scale, channel_of, holding
 from imutool.errors import ConfigError
 from imutool.mcap_io.temperature import is_temperature
 from imutool.recording import Recording, Scalars, seconds
 from imutool.sensor.signals import TEMPERATURE_TERMS, Load, SignalFilter, Signals
-from imutool.units import Sensor
+from imutool.units import COLUMNS, Sensor
 
 MIN_RANGE_K = 1.0  # over all logs: less tells nothing about a temperature
 STEP_S = 10.0  # between two numbers of the drift, from which its walk is taken

@@ -13,7 +13,7 @@ from imutool.diagnosis.audit.faults import FaultFound, clear, found
 from imutool.diagnosis.audit.motion import KinematicFit, kinematic_fit, kinematics
 from imutool.diagnosis.result import Estimate
 from imutool.recording import Recording
-from imutool.units import Sensor
+from imutool.units import COLUMNS, Sensor
 
 BANDS = ((0.2, 0.35), (0.5, 0.65), (0.85, 0.97))  # of Nyquist
 FALLS, STEP, WHITE = 0.35, 0.75, 0.75  # of the noise that is left near Nyquist, and from band to band; of white noise
@@ -30,7 +30,7 @@ def max_filter_delays(sim: Recording, fit: KinematicFit) -> tuple[float, float]:
     is what a mean leaves, as a difference of attitudes is one.
     """
     out = []
-    for name, samples, part in (("tau_g", sim.imu.gyro, slice(0, 3)), ("tau_f", sim.imu.accel, slice(3, 6))):
+    for name, samples, part in (("tau_g", sim.imu.gyro, COLUMNS["gyro"]), ("tau_f", sim.imu.accel, COLUMNS["accel"])):
         late, residual = fit.estimates[name], fit.residual[:, part]
         if clear(late):
             k = kinematics(replace(sim, imu=replace(sim.imu, t_ns=sim.imu.t_ns - round(late.value * 1e9))))

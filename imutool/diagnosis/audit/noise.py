@@ -20,7 +20,7 @@ from imutool.diagnosis.result import Estimate
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu
 from imutool.recording.columns import true_ranges
-from imutool.units import SENSORS, UNITS, Sensor
+from imutool.units import COLUMNS, SENSORS, UNITS, Sensor
 
 Column = Float64[np.ndarray, " k"]
 ABSENT = 0.02  # of the expected noise: less is none
@@ -74,12 +74,12 @@ class Expected:
         """Whether the noise of a recording shows a filter; that of a data sheet is white."""
         if self.samples is None:
             return False
-        part = self.samples[:, 3 * SENSORS.index(sensor) : 3 * SENSORS.index(sensor) + 3]
+        part = self.samples[:, COLUMNS[sensor]]
         return max_filter_delay(part, part) > 0.0
 
     def sample(self, sensor: Sensor, rate_hz: float) -> tuple[float, float]:
         """Least and most noise of a sample at a rate; digits add to the noise of a recording."""
-        part = slice(3 * SENSORS.index(sensor), 3 * SENSORS.index(sensor) + 3)
+        part = COLUMNS[sensor]
         density, lsb = float(np.nanmedian(self.density[part])), float(np.median(self.lsb[part]))
         minimum = _without_digits(density * np.sqrt(self.rate_hz or rate_hz), lsb) / np.sqrt(self.rate_hz or rate_hz)
         return minimum * np.sqrt(rate_hz), density * np.sqrt(rate_hz)
@@ -131,8 +131,8 @@ def noise_faults(
         found("step_lines", line.sensor, f=Estimate(line.f_hz, line.width_hz, "Hz")) for line in lines if line.cause == "sensor"
     ]
     out += _repeated(samples)
-    for k, sensor in enumerate(SENSORS):
-        part = slice(3 * k, 3 * k + 3)
+    for sensor in SENSORS:
+        part = COLUMNS[sensor]
         lsb = np.array([grid(column) for column in samples[:, part].T])
         own = float(np.median(fast_noise(residual[:, part], rate_hz, lsb)))
         noise = _without_digits(own, float(np.median(lsb))), own

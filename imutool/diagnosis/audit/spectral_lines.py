@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from imutool.array_types import Bool, Float64, Rows6, Vectors
 from imutool.inertial.kinematics import G_W
 from imutool.recording import Poses
-from imutool.units import SENSORS, Sensor
+from imutool.units import COLUMNS, SENSORS, Sensor
 
 Column = Float64[np.ndarray, " f"]
 Cause = Literal["motion", "sensor", "unknown"]
@@ -84,7 +84,7 @@ def spectral_lines(
     out: list[SpectralLine] = []
     cause_names: tuple[Cause, Cause] = ("sensor", "unknown")
     for k, sensor in enumerate(SENSORS):
-        part = slice(3 * k, 3 * k + 3)
+        part = COLUMNS[sensor]
         found, whole = (_spectrum(x[:, part], rate_hz, size) for x in (residual, samples))
         poses = _spectrum(shown[:, part], poses_hz, min(round(size * poses_hz / rate_hz), len(shown)))
         by_poses, width_hz = Shown(poses, poses_hz, order=2 * k + 2), rate_hz / size

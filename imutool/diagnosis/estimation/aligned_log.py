@@ -16,12 +16,11 @@ from imutool.inertial.wiener import NoiseLeft
 from imutool.recording import Poses
 from imutool.sensor.effect import Effect, SignalState, Theta
 from imutool.sensor.samples import NOTHING, IdealMotion, SensorSamples
-from imutool.units import ASCII_UNITS, AXES
+from imutool.units import ASCII_UNITS, AXES, COLUMNS
 
 DEFAULT = DiagnoseSettings()
 Blocks = tuple[tuple[int, Float64[np.ndarray, "n _"]], ...]
 Variables = Mapping[str, tuple[str, Float64[np.ndarray, " n"]]]
-IMU_SIGNALS: Mapping[str, slice] = {"gyro": slice(0, 3), "accel": slice(3, 6)}
 
 
 class ClockDifference(NamedTuple):
@@ -176,7 +175,7 @@ class Pair(AlignedLog):
     @property
     def signals(self) -> Mapping[str, slice]:
         """Gyro and accelerometer."""
-        return IMU_SIGNALS
+        return COLUMNS
 
     def unit_of(self, signal: str) -> str:
         """rad/s or m/s^2."""

@@ -26,6 +26,7 @@ from imutool.noise.bias_walk import INDEPENDENT
 from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.effects import vibration
+from imutool.units import COLUMNS
 
 logger = logging.getLogger(__name__)
 
@@ -71,11 +72,7 @@ def whitened_stretches(pairs: Sequence[Pair], candidates: Callable[[Pair], Seque
 
 
 def _check_rows(pair: Pair, band: Band) -> None:
-    """Refuse a log with too few rows in the band for a noise model.
-
-    Raises:
-        DataError: an axis has too few rows that follow others without a gap.
-    """
+    """Refuse a log with too few rows in the band for a noise model."""
     order = pair.settings.noise.order
     usable = pair.usable[:: band.every]
     counts = [int(settled(rows, order).sum()) for rows in usable.T if rows.any()]
@@ -121,7 +118,7 @@ def limited_to_quiet_axes(whiten: Whitener, maximum: float) -> Whitener:
     """
     filters, std = whiten.filters.copy(), whiten.std.copy()
     total = noise_std(whiten)
-    for part in (slice(0, 3), slice(3, 6)):
+    for part in COLUMNS.values():
         middle = int(np.argsort(total[part])[1]) + part.start
         for axis in range(part.start, part.stop):
             if total[axis] > maximum * total[middle]:

@@ -16,7 +16,7 @@ from imutool.diagnosis.settings import TimestampSettings
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
 from imutool.sensor.effects import saturation
-from imutool.units import ASCII_UNITS, AXES, SENSORS, UNITS
+from imutool.units import ASCII_UNITS, AXES, COLUMNS, SENSORS, UNITS
 
 SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft limit is looked for
 MIN_VALUES, MIN_ROWS = 3, 100  # of a grid
@@ -127,10 +127,10 @@ def dropped(pairs: Sequence[Pair]) -> list[Finding]:
 def rounded(pairs: Sequence[Pair], floor: Float64[np.ndarray, "6"]) -> list[Finding]:
     """Finding of quantization: values on a grid as coarse as the noise."""
     settings, lsb = pairs[0].settings.timestamps, {}
-    for k, signal in enumerate(SENSORS):
-        axes = [pair.real[:, a] for pair in pairs for a in range(3 * k, 3 * k + 3)]
+    for signal, part in COLUMNS.items():
+        axes = [x for pair in pairs for x in pair.real[:, part].T]
         grids = [grid(x, settings) for x in axes if len(np.unique(x)) >= MIN_VALUES] or [0.0]  # fewer lie on any grid
-        noise = float(np.sqrt(np.mean(floor[3 * k : 3 * k + 3] ** 2)))
+        noise = float(np.sqrt(np.mean(floor[part] ** 2)))
         if min(grids) > settings.min_digits * noise and max(grids) < 1.5 * min(grids):
             lsb[signal] = float(np.median(grids))
     if not lsb:
@@ -185,7 +185,7 @@ def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]
     for k, signal in enumerate(SENSORS):
         if any(key.startswith(signal) for pair in pairs for key in limits(pair.real, pair.settings.timestamps)):
             continue
-        part = slice(3 * k, 3 * k + 3)
+        part = COLUMNS[signal]
         bias = np.mean([b[part] for b in biases], axis=0)
         for ahead, variant in ((bias, ("", "accel")[k]), (0.0 * bias, f"corrected {signal}")):
             real = [pair.real[:, part] - bias + ahead for pair in pairs]

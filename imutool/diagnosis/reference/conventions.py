@@ -19,7 +19,7 @@ from imutool.diagnosis.audit.motion import OTHER_UNIT
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.result import Estimate, Finding, HeldOut
-from imutool.units import ASCII_UNITS, AXES, SENSORS, Sensor
+from imutool.units import ASCII_UNITS, AXES, COLUMNS, SENSORS, Sensor
 
 EXPLAINED = 0.03  # of the motion's squares: a convention leaves less, unless the mount is turned by 10 degrees besides
 EXPLAINED_AS_OTHER = 0.3  # likewise, if the other sensor shows the same axes: a large lever arm is left next to a convention
@@ -33,8 +33,8 @@ def with_common_conventions(pairs: Sequence[Pair], of: str = "simulation") -> tu
     `of` is what the reference is called.
     """
     shown: dict[Sensor, _Convention] = {}
-    for k, sensor in enumerate(SENSORS):
-        part = slice(3 * k, 3 * k + 3)
+    for sensor in SENSORS:
+        part = COLUMNS[sensor]
         rows = [pair.usable[:, part].all(axis=1) for pair in pairs]
         y, x = (
             np.concatenate([values[:, part][row] for values, row in zip(each, rows, strict=True)])
@@ -102,8 +102,8 @@ def _correlation(y: Vectors, x: Vectors) -> float:
 
 def _converted(pair: Pair, changes: dict[Sensor, tuple[float, Matrix]]) -> Pair:
     turn = np.zeros((6, 6))
-    for k, (factor, P) in enumerate(changes.values()):
-        turn[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = factor * P
+    for sensor, (factor, P) in changes.items():
+        turn[COLUMNS[sensor], COLUMNS[sensor]] = factor * P
     known = None if pair.known is None else np.asarray(pair.known.astype(float) @ (turn != 0.0) > 0.5)
     return replace(pair, real=np.asfortranarray(pair.real @ turn), known=known)
 
@@ -138,7 +138,7 @@ def _finding(
     after: Sequence[Pair],
 ) -> Finding:
     """Finding with what the convention alone removes of the samples on held-out time, all axes together."""
-    part = slice(3 * SENSORS.index(sensor), 3 * SENSORS.index(sensor) + 3)
+    part = COLUMNS[sensor]
 
     def rms(pairs: Sequence[Pair]) -> float:
         residuals = [(pair.real - expected(pair, ()))[pair.held_out, part] for pair in pairs]

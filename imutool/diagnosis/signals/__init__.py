@@ -96,11 +96,7 @@ def _left_out(diagnosis: Diagnosis, name: str, error: DataError) -> Diagnosis:
 def _compared(
     diagnosis: Diagnosis, pair: SignalPair, pairing: Pairing, settings: DiagnoseSettings, clocks: list[float]
 ) -> Diagnosis:
-    """Diagnosis with one more signal, whose clock joins `clocks`; a remark where a part of it cannot be compared.
-
-    Raises:
-        DataError: no part can.
-    """
+    """Diagnosis with one more signal, whose clock joins `clocks`; a remark where a part of it cannot be compared."""
     drivers = {name: values for name, values in pairing.drivers.items() if not name.startswith(f"{pair.name}.")}
     try:
         added = diagnose_signal(pair, drivers, settings)

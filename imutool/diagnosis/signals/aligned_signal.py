@@ -188,11 +188,7 @@ def _aligned(
     density: Float64[np.ndarray, " k"],
     settings: DiagnoseSettings,
 ) -> AlignedSignal:
-    """Recorded rows with their ideal signal, of one clock.
-
-    Raises:
-        DataError: too few rows.
-    """
+    """Recorded rows with their ideal signal, of one clock."""
     t_real = seconds(pair.real_ns, int(pair.real_ns[0]))
     _refuse_little(t_real[rows], pair.name, settings.signal)
     part = slice(int(rows[0]), int(rows[-1]) + 1)
@@ -216,11 +212,7 @@ def _aligned(
 
 
 def _refuse_little(t_s: Column, name: str, settings: SignalSettings) -> None:
-    """Refuses a short time.
-
-    Raises:
-        DataError: less than the settings say.
-    """
+    """Refuses a short time."""
     shared_s = float(t_s[-1] - t_s[0]) if len(t_s) > 1 else 0.0
     if shared_s < settings.min_s or len(t_s) < settings.min_samples:
         raise DataError(
@@ -232,11 +224,7 @@ def _refuse_little(t_s: Column, name: str, settings: SignalSettings) -> None:
 
 
 def _check(t_ns: Int64[np.ndarray, " n"], values: Column, what: str, name: str, settings: SignalSettings) -> None:
-    """Refuses what holds nothing to compare.
-
-    Raises:
-        DataError: too short, not finite, stamps that do not increase, constant.
-    """
+    """Refuses what holds nothing to compare."""
     length = float(t_ns[-1] - t_ns[0]) * 1e-9 if len(t_ns) else 0.0
     if length < settings.min_s or len(t_ns) < settings.min_samples:
         raise DataError(

@@ -150,9 +150,6 @@ def _refuse_contradictory(state: Mapping[str, Fields], pair: SignalPair, log: st
     """Refuses velocities that are no rates of the positions next to them.
 
     They are compared by the way of each second: a velocity that is filtered, or late, goes the same way but for a small part.
-
-    Raises:
-        DataError: a joint goes another way by its velocity than by its position.
     """
     contradictions = list[tuple[float, float, float, str]]()
     for label in (label for label in state if label.startswith("q") and f"d{label}" in state):
@@ -229,11 +226,7 @@ def _faster(fields: Mapping[str, Fields], rate_hz: float, above_hz: float) -> fl
 
 
 def _refuse_fast(pair: SignalPair, settings: SignalSettings) -> None:
-    """Refuses an arm whose motion is too fast for its samples to be differentiated.
-
-    Raises:
-        DataError: a good part of the velocities is above the highest frequency that is compared.
-    """
+    """Refuses an arm whose motion is too fast for its samples to be differentiated."""
     for state, log in ((pair.state, "recording"), (pair.sim_state, "simulation")):
         rate_hz = 1e9 / float(np.median(np.diff(next(iter(state.values())).t_ns)))
         max_hz = settings.motion_band_share * rate_hz

@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from imutool.array_types import Float, Int
-from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.threads import of_each
 from imutool.errors import DataError
@@ -32,7 +31,7 @@ from imutool.training.calibration.log_scatter import (
     widest,
 )
 from imutool.training.training_windows import Part, Pool, Windows
-from imutool.units import SENSORS, Sensor
+from imutool.units import COLUMNS, SENSORS, Sensor
 
 W_PRIOR = 0.05  # plausible misalignment; a scale error of 0.1 is two of these
 CORRELATED = 10.0  # errors of the truth last longer than a window: this many windows are taken to say the same once

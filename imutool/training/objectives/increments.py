@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from imutool.array_types import Bool, Float, Int
-from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import Segment
 from imutool.errors import DataError
 from imutool.geometry import so3
@@ -27,6 +26,7 @@ from imutool.training.calibration import closed_form
 from imutool.training.calibration.closed_form import median_per_log
 from imutool.training.objectives.objective import USUAL_SAMPLES, Objective, length
 from imutool.training.training_windows import corrected, sensors_up_to
+from imutool.units import COLUMNS
 
 USUAL_BATCH = 4  # stretches at a time
 

@@ -21,7 +21,6 @@ from torch import Tensor, nn
 from torch.optim.adamw import adamw
 
 from imutool.array_types import Float, Int
-from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.threads import of_each
 from imutool.geometry import so3
@@ -30,7 +29,7 @@ from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber, step_means
 from imutool.training.calibration.closed_form import median_per_log
 from imutool.training.settings import TrainSettings
 from imutool.training.training_windows import Pool, Windows
-from imutool.units import SENSORS, Sensor
+from imutool.units import COLUMNS, SENSORS, Sensor
 
 TRACK_UNIT = {"gyro": 1e-1, "accel": 1.0}  # one unit of a track's parameter, rad/s and m/s²
 TRACK_WALK = {"gyro": 1e-4, "accel": 2e-3}  # how far a rest bias may walk in a second^1/2, rad/s and m/s²

@@ -20,7 +20,6 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from imutool.array_types import Bool, Float, Int
-from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.neural_ode import Network
 from imutool.bias.networks.paper_ode import BiasOde
@@ -32,7 +31,7 @@ from imutool.inertial.windows import step_means
 from imutool.training.fit import Stage, Training
 from imutool.training.objectives.objective import BATCH_SAMPLES, AdamW, Objective
 from imutool.training.training_windows import Part, Pool
-from imutool.units import Sensor
+from imutool.units import COLUMNS, Sensor
 
 LOSS_UNITS = 1e6  # mrad² and mm², as in the released code: in rad² gradients would be as small as Adam's epsilon
 CUBIC = 3  # order of the smoothing polynomial

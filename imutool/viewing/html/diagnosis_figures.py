@@ -13,11 +13,10 @@ from scipy.signal import fftconvolve, welch
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Bool, Float64
-from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS
 from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.result import Curve, Diagnosis, Located, SignalTraces, Traces
 from imutool.diagnosis.wording.effect_sentences import signals
-from imutool.units import AXES, UNITS
+from imutool.units import AXES, COLUMNS, UNITS
 from imutool.viewing.html.drawing import plain_tick_labels, svg
 from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, TITLES
 from imutool.viewing.model.decimation import DecimatedLine, Line, average_log_bins, decimate_extremes, true_intervals
@@ -35,7 +34,7 @@ GAP_PERIODS = 1.5  # sample periods without a sample that end a stretch
 def compared_signals(traces: Sequence[Traces]) -> Mapping[str, slice]:
     """Columns of the signals that were compared: of the gyro alone if no position is known."""
     positions = any(trace.truth is None or trace.truth.has_positions for trace in traces)
-    return IMU_SIGNALS if positions else {"gyro": IMU_SIGNALS["gyro"]}
+    return COLUMNS if positions else {"gyro": COLUMNS["gyro"]}
 
 
 def misfit_strip(d: Diagnosis, trace: Traces) -> str:
@@ -48,7 +47,7 @@ def misfit_strip(d: Diagnosis, trace: Traces) -> str:
         heights = _local_rms(trace, edges)
         for row, name in enumerate(names):
             signal, axis = name.split()
-            top = np.nanmax(heights[:, IMU_SIGNALS[signal]], initial=0.0)
+            top = np.nanmax(heights[:, COLUMNS[signal]], initial=0.0)
             if top > 0.0:
                 area = np.nan_to_num(heights[:, row]) / top * 0.9
                 axes.fill_between(edges[:-1], -row, -row + area, step="post", color=INK, alpha=0.55, lw=0)
@@ -149,7 +148,7 @@ def residual_against_attitude(d: Diagnosis) -> str | None:
 
     if any(trace.truth is None for trace in d.traces):
         return None
-    return _binned(d, variable, dict.fromkeys(IMU_SIGNALS, "{} above the horizon (°)"), "attitude")
+    return _binned(d, variable, dict.fromkeys(COLUMNS, "{} above the horizon (°)"), "attitude")
 
 
 def curve(smooth: Curve, signal: str) -> str:

@@ -20,7 +20,7 @@ from imutool.errors import ConfigError, ImutoolError
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.mcap_io.storage.target import Target
 from imutool.recording import Imu, Poses
-from imutool.units import SENSORS
+from imutool.units import COLUMNS, SENSORS
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import level_start
 from imutool.viewing.rerun import connect, layout, rr, sdk, viewer
@@ -35,7 +35,6 @@ FLUSH_BATCH_S = 0.05  # for a batch to be sent
 STALLED_S = 5.0  # without a sent batch: the viewer does not keep up, and waiting batches fill our memory
 SCENE_SIZE_M = 5.0  # while the extent of the path is unknown
 FOOTER, FOOTER_BYTES = b"RRF2FOOT", 16  # end of an .rrd file
-COLUMNS = (slice(0, 3), slice(3, 6))  # of gyro and accel
 ERRORS = (ImutoolError, RuntimeError, ValueError, TypeError, OSError)
 
 logger = logging.getLogger("imutool")
@@ -218,7 +217,7 @@ class _Imu:
         raw = np.hstack([block.batch.gyro, block.batch.accel])[new]
         bias, margin = block.bias[new], SIGMAS * block.std[new]
         curves: dict[str, np.ndarray] = {}
-        for kind, columns in zip(SENSORS, COLUMNS, strict=True):
+        for kind, columns in COLUMNS.items():
             curves[self._path("imu", kind, "raw")] = raw[:, columns]
             curves[self._path("imu", kind, "debiased")] = (raw - bias)[:, columns]
             curves[self._path("bias", kind, "estimated")] = bias[:, columns]

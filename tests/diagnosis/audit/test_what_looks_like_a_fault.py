@@ -19,8 +19,8 @@ from imutool.diagnosis.audit.axes import Matrix
 from imutool.diagnosis.audit.bandwidth import max_filter_delay
 from imutool.diagnosis.audit.faults import clear
 from imutool.diagnosis.audit.motion import kinematic_fit, kinematics
+from imutool.diagnosis.audit.motion_faults import timing_faults
 from imutool.diagnosis.audit.noise import Expected, fast_noise, noise_faults
-from imutool.diagnosis.audit.timing import timing_faults
 from imutool.diagnosis.result import Estimate
 from imutool.mcap_io.write import write
 from imutool.noise.datasheet import Noise
