@@ -41,9 +41,8 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
@@ -279,9 +278,3 @@ def _term(term: Term, k: int, where: str | Path) -> Effect:
     if effect is None:
         raise _unknown(f"term[{k}].term", term.term, [f"products of {', '.join(VARIABLES)}"], where)
     return effect
-
-
-def plain(file: PhysicsFile) -> dict[str, Any]:
-    """The file as JSON values."""
-    values: dict[str, Any] = msgspec.to_builtins(file)
-    return values

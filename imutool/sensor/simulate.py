@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from imutool.array_types import Float64, Int64
+from imutool.config import plain
 from imutool.errors import ConfigError, DataError, ImutoolError, LogError
 from imutool.file_location import same_location
 from imutool.geometry import quaternion
@@ -122,7 +123,7 @@ def simulate(
     settings = {
         "command": "simulate",
         "trajectory": trajectory.name,
-        "physics": physics_file.plain(file),
+        "physics": plain(file),
         "noise": noises.plain(sheet) | {"name": str(noise)},
         **simulation.settings,
     }

@@ -44,6 +44,7 @@ class AlignedLog(ABC):
     real: Float64[np.ndarray, "n k"]
     fitted: Bool[np.ndarray, " n"]
     held_out: Bool[np.ndarray, " n"]
+    ideal: Any = field(kw_only=True)  # signals of a sensor without effects, with a method `sample`
     known: Bool[np.ndarray, "n k"] | None = field(default=None, kw_only=True)
     band_hz: float | None = field(default=None, kw_only=True)
     aligned_s: float = field(default=0.0, kw_only=True)
@@ -65,10 +66,6 @@ class AlignedLog(ABC):
     @abstractmethod
     def denoised(self) -> bool:
         """Whether the expectation had noise of its own, which was filtered out."""
-
-    @abstractmethod
-    def state(self) -> SignalState:
-        """Ideal signals before any effect, to be sampled at the log's stamps."""
 
     @abstractmethod
     def blocks(self, samples: Any) -> Blocks:
@@ -120,6 +117,10 @@ class AlignedLog(ABC):
         """Stamp of the log's first sample, from which `stamp_s` counts."""
         return self.start_ns - round(float(self.stamp_s[0]) * 1e9)
 
+    def state(self) -> SignalState:
+        """Ideal signals before any effect, to be sampled at the log's stamps."""
+        return SignalState(self.ideal, self.stamp_s, self.stamp_s)
+
     def starts(self, effect: Effect) -> list[Theta]:
         """Parameters to start a fit of an effect from."""
         if effect.starts is None:
@@ -163,10 +164,6 @@ class Pair(AlignedLog):
     def denoised(self) -> bool:
         """Whether the simulation's samples were filtered."""
         return bool(self.sim_noise.any())
-
-    def state(self) -> SignalState:
-        """The ideal motion, to be sampled at the stamps."""
-        return SignalState(self.ideal, self.stamp_s, self.stamp_s)
 
     def blocks(self, samples: SensorSamples) -> Blocks:
         """Gyro, then accelerometer."""

@@ -26,7 +26,6 @@ from imutool.inertial.stationary import white_noise
 from imutool.inertial.wiener import NoiseLeft
 from imutool.mcap_io.fields import Fields
 from imutool.recording import nanoseconds, seconds
-from imutool.sensor.effect import SignalState
 from imutool.sensor.robot_effects.joint_dynamics import Dynamics
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, SignalSamples
 from imutool.sensor.robot_effects.signal_sizes import Scale, moved
@@ -66,10 +65,6 @@ class AlignedSignal(AlignedLog):
     def bias_std(self) -> Float64[np.ndarray, " k"]:
         """The offset is an effect, which acts before saturation."""
         return np.full(self.columns, 1e-9)
-
-    def state(self) -> SignalState:
-        """The ideal signal, to be sampled at the stamps."""
-        return SignalState(self.ideal, self.stamp_s, self.stamp_s)
 
     def blocks(self, samples: SignalSamples) -> Blocks:
         """All columns."""
