@@ -15,7 +15,7 @@ import numpy as np
 from imutool.array_types import Float64, Rows6, Vectors
 from imutool.bias import static
 from imutool.bias.model import BiasModel, Vector6
-from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_blocks, filter_together
+from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_blocks, filter_together, without_motion
 from imutool.bias_start.initial_bias import (
     AT_REST_STD,
     TRACKED_BY,
@@ -211,9 +211,8 @@ def refuted_stops(samples: Samples, model: BiasModel) -> tuple[Vector6, Vector6]
     """
     own = bias_prior(model)
     known = replace(UNTRAINED, mean=own.mean, std=UNKNOWN_STD, settings=own.settings)
-    bias, (t_s, gyro, accel) = model.stream(own.mean)(*samples) - own.mean, samples
     filters = [BiasFilter(each, ahead=True) for each in (known, replace(known, stops=False))]
-    runs = zip(*filter_together(filters, [(t_s, gyro - bias[:, :3], accel - bias[:, 3:])] * 2), strict=True)
+    runs = zip(*filter_together(filters, [without_motion(model, samples, own.mean)] * 2), strict=True)
     later = list(itertools.dropwhile(lambda blocks: not blocks[0].resting, runs))
     moving = list(zip(*(blocks for blocks in later if not blocks[0].resting), strict=True))
     if not moving:

@@ -26,7 +26,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64, Rows6, Vectors
 from imutool.bias.model import BiasEstimate, BiasModel, Covariances
 from imutool.bias_start.initial_bias import InitialBias, model_samples
-from imutool.bias_start.stretches import measured
+from imutool.bias_start.stretches import measured_rows
 from imutool.geometry import quaternion
 from imutool.inertial.preintegration import hat
 from imutool.recording import Imu, Poses, seconds
@@ -100,8 +100,7 @@ class ExpectedDrift:
     """
 
     def __init__(self, model: BiasModel, start: InitialBias, imu: Imu) -> None:
-        good = measured(imu.gyro, imu.accel)
-        self._imu = imu if good.all() else imu.rows(good)
+        self._imu = measured_rows(imu)
         self._model, self._estimator, self._done = model, BiasEstimator(model, start), 0
         self._samples = model_samples(model, imu)
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Float64, Int64, Rows6, Vectors
-from imutool.bias.model import GAP_S, BiasEstimate, BiasModel
+from imutool.bias.model import GAP_S, BiasEstimate, BiasModel, Vector6
 from imutool.bias_start.prior_width import MAX_CHANGE, MAX_DEVIATIONS, BiasPrior
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State, Step
@@ -260,6 +260,13 @@ def _diagonal(variance: Rows6) -> Float64[np.ndarray, "n 6 6"]:
     covariance = np.zeros((len(variance), 6, 6))
     covariance[:, range(6), range(6)] = variance
     return covariance
+
+
+def without_motion(model: BiasModel, samples: Samples, mean: Vector6) -> Samples:
+    """Samples minus the model's motion-dependent bias, about a rest bias."""
+    t_s, gyro, accel = samples
+    bias = model.stream(mean)(t_s, gyro, accel) - mean
+    return t_s, gyro - bias[:, :3], accel - bias[:, 3:]
 
 
 def filter_blocks(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> Iterator[FilteredBlock]:

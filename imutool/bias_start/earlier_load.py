@@ -17,7 +17,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Vectors
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_together
+from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_together, without_motion
 from imutool.bias_start.fitness import head
 from imutool.bias_start.initial_bias import bias_prior
 from imutool.errors import ConfigError
@@ -92,12 +92,10 @@ def _log_likelihood(models: Sequence[BiasModel], samples: Samples, first_ns: int
 
     The models are one after different loads.
     """
-    (t_s, gyro, accel), prior, without = samples, bias_prior(models[0], first_ns), list[Samples]()
-    for model in models:
-        bias = model.stream(prior.mean)(t_s, gyro, accel) - prior.mean
-        without.append((t_s, gyro - bias[:, :3], accel - bias[:, 3:]))
+    prior = bias_prior(models[0], first_ns)
+    without = [without_motion(model, samples, prior.mean) for model in models]
     found, out = filter_together([BiasFilter(prior, ahead=True) for _ in models], without), []
-    for blocks, (_, rates, _) in zip(found, without, strict=True):
+    for blocks, (t_s, rates, _) in zip(found, without, strict=True):
         in_motion = float(innovations(block.step for block in blocks).log_likelihood.sum())
         out.append(in_motion + _at_rest([block for block in blocks if block.resting], t_s, rates))
     return np.array(out)

@@ -39,7 +39,7 @@ from imutool.bias_start.bias_at_rest import (
     shown_at_rest,
     stops_in,
 )
-from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_together, stops_of
+from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_together, stops_of, without_motion
 from imutool.bias_start.initial_bias import AT_REST_STD, MIN_STD, InitialBias, bias_prior
 from imutool.bias_start.prior_width import (
     MAX_CHANGE,
@@ -110,7 +110,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
 def _trained(model: BiasModel, start: InitialBias, samples: Samples, about: Mapping[str, str], prior: BiasPrior) -> Fitness:
     """Fitness of a trained model."""
     unknown = replace(prior, mean=np.where(np.abs(prior.mean) > UNKNOWN_STD, prior.mean, 0.0), std=UNKNOWN_STD, minimum=None)
-    corrected, of_sensor = (_without_motion(each, samples, prior) for each in (model, without_lever_arm(model)))
+    corrected, of_sensor = (without_motion(each, samples, prior.mean) for each in (model, without_lever_arm(model)))
     at_poses = (*samples[:2], samples[2] + corrected[2] - of_sensor[2])  # a lever arm is no error of the sensor
     found, none = _evidence((corrected, at_poses), (prior, unknown))
     shown_std = np.sqrt(DEPENDENT**2 * found.variance + AT_REST_STD**2)
@@ -127,7 +127,7 @@ def _trained(model: BiasModel, start: InitialBias, samples: Samples, about: Mapp
     if harmful or contradictions:
         used = _started(start, prior)
         same = np.array_equal(used.mean, prior.mean)
-        worse = _worse_than_none(corrected if same else _without_motion(model, samples, used), used, found, prior, none)
+        worse = _worse_than_none(corrected if same else without_motion(model, samples, used.mean), used, found, prior, none)
         opposite = bool(refuted) and share.value < -SURE * share.std
         if harmful or other_axes or worse or opposite or (new_bias and refuted):
             return Fitness("unfit", (*other_start, *contradictions, *worse))
@@ -170,13 +170,6 @@ def head(batches: Iterable[Samples]) -> Samples:
     gyro, accel = (np.concatenate([np.zeros((0, 3)), *(part[column] for part in parts)]) for column in (1, 2))
     end = int(np.searchsorted(t_s, CHECKED_S))
     return t_s[:end], gyro[:end], accel[:end]
-
-
-def _without_motion(model: BiasModel, samples: Samples, prior: BiasPrior) -> Samples:
-    """Samples minus the model's motion-dependent bias."""
-    t_s, gyro, accel = samples
-    bias = model.stream(prior.mean)(t_s, gyro, accel) - prior.mean
-    return t_s, gyro - bias[:, :3], accel - bias[:, 3:]
 
 
 def _started(start: InitialBias, prior: BiasPrior) -> BiasPrior:

@@ -39,7 +39,7 @@ from imutool.bias_start.bias_tracking import (
     smooth_blocks,
 )
 from imutool.bias_start.prior_width import USUAL_WALK, BiasPrior, LeastWidth, shown_bias, std_before, supported_std
-from imutool.bias_start.stretches import MAX, StretchClock, measured
+from imutool.bias_start.stretches import MAX, StretchClock, measured_rows
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.inertial_filter import FilterSettings
 from imutool.recording import Imu, seconds
@@ -248,15 +248,13 @@ def accuracy(std: Vector6) -> str:
 
 def relative_samples(imu: Imu) -> Samples:
     """Measured samples with seconds since the first; a long gap counts as `MAX_GAP_S`."""
-    good = measured(imu.gyro, imu.accel)
-    imu = imu if good.all() else imu.rows(good)
+    imu = measured_rows(imu)
     return seconds(StretchClock()(imu.t_ns), int(imu.t_ns[0]) if len(imu) else 0), imu.gyro, imu.accel
 
 
 def model_samples(model: BiasModel, imu: Imu) -> Samples:
     """Samples as `relative_samples`, without the drift that the model follows in their log."""
-    good = measured(imu.gyro, imu.accel)
-    return relative_samples(without_drift(model, imu if good.all() else imu.rows(good)))
+    return relative_samples(without_drift(model, measured_rows(imu)))
 
 
 class SmoothedBias(NamedTuple):

@@ -33,7 +33,7 @@ from imutool.bias_start.initial_bias import (
     tracked_from_prior,
     training_source,
 )
-from imutool.bias_start.stretches import Sieve, measured
+from imutool.bias_start.stretches import Sieve, measured_rows
 from imutool.cleaning import Survey, cleaned
 from imutool.cleaning.samples import refuse_mixed
 from imutool.cleaning.survey import raw_batches
@@ -75,9 +75,7 @@ def find_initial_bias(init: str, model: BiasModel, recording: Recording) -> Init
         DataError: `stationary` on a log that does not start at rest, `truth` without truth at its start, or `auto` with an
             untrained model and no stationary stretch.
     """
-    good = measured(recording.imu.gyro, recording.imu.accel)
-    imu = recording.imu if good.all() else recording.imu.rows(good)
-    recording = replace(recording, imu=without_drift(model, imu))
+    recording = replace(recording, imu=without_drift(model, measured_rows(recording.imu)))
     if init == "prior":
         return replace(tracked_from_prior(model, int(recording.imu.t_ns[0])), how=training_source(model), follows=None)
     if init == "truth" or init.startswith("truth:"):
@@ -272,7 +270,7 @@ def estimate_at_rest(imu: Imu, where: str | Location) -> tuple[BiasModel, Initia
         DataError: fewer than two samples.
         ModelError: the log never rests.
     """
-    kept = imu.rows(measured(imu.gyro, imu.accel))
+    kept = measured_rows(imu)
     if len(kept) < 2:  # raw counts, for instance
         raise DataError(f"{len(kept)} of {len(imu)} samples are a measurement", where=where, fix="See imutool info LOG")
     return _estimate(block_statistics([(kept.t_ns, kept.gyro, kept.accel)], kept.period_s), where)

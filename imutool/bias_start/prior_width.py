@@ -30,7 +30,7 @@ FEW_SESSIONS, MAX_LEFT_OF_FEW = 3, 0.12  # few say little of the next one; TUM-V
 CONTRADICTED = (np.inf, 10.8, 13.8, 16.3)  # chi-square of as many differences; a true prior exceeds it once in a thousand logs
 
 
-Rows6 = Float64[np.ndarray, "*batch 6"]
+Sixes = Float64[np.ndarray, "*batch 6"]  # one or several vectors of six
 
 
 class LeastWidth(NamedTuple):
@@ -83,7 +83,7 @@ class BiasPrior:
         at_rest = resting[:, None, None]
         return np.where(at_rest[..., 0], bias + ground, bias), np.where(at_rest, both, P[:, :6, :6])
 
-    def _share_of_width(self, difference: Rows6, variance: Rows6, narrow: Rows6) -> Rows6:
+    def _share_of_width(self, difference: Sixes, variance: Sixes, narrow: Sixes) -> Sixes:
         """Variance of the bias over all widths that the log allows, by that for the width of variance `narrow`; 1 or more.
 
         Each width w shows the mean d g and the variance w^2 (1 - g) with g = w^2 / (w^2 + v).
@@ -101,11 +101,11 @@ class BiasPrior:
 
 
 def shown_bias(
-    bias: Float64[np.ndarray, "*batch 6"],
-    after: Float64[np.ndarray, "*batch 6"],
+    bias: Sixes,
+    after: Sixes,
     mean: Vector6,
-    before: Float64[np.ndarray, "*batch 6"],
-) -> tuple[Float64[np.ndarray, "*batch 6"], Float64[np.ndarray, "*batch 6"]]:
+    before: Sixes,
+) -> tuple[Sixes, Sixes]:
     """Bias minus the prior's mean, as a log shows it without the prior, and its variance.
 
     Axis by axis from the variances after and before the log: the difference of the precisions. The variance is infinite where
@@ -186,9 +186,9 @@ def untold_bias(mean: Vector6, std: Vector6) -> str:
 def supported_std(
     std: Vector6,
     minimum: LeastWidth | None,
-    difference: Float64[np.ndarray, "*batch 6"],
-    variance: Float64[np.ndarray, "*batch 6"],
-) -> Float64[np.ndarray, "*batch 6"]:
+    difference: Sixes,
+    variance: Sixes,
+) -> Sixes:
     """Standard deviation of a prior that a log supports.
 
     `difference` and `variance` are those of `widened`. Some sensors repeat their turn-on bias to 0.1 mrad/s, some to 20 mrad/s,
@@ -221,7 +221,7 @@ def std_before(std: Vector6, minimum: LeastWidth | None) -> Vector6:
 
 
 def _possible_widths(
-    std: Rows6, minimum: LeastWidth, difference: Rows6, variance: Rows6, columns: slice
+    std: Sixes, minimum: LeastWidth, difference: Sixes, variance: Sixes, columns: slice
 ) -> tuple[Float64[np.ndarray, "*batch widths 3"], Float64[np.ndarray, "*batch widths 1"]]:
     """Widths of a sensor's prior from the least to the most, and their probabilities given what the log shows."""
     maximum, square, noise = std[..., None, columns], difference[..., None, columns] ** 2, variance[..., None, columns]
@@ -235,9 +235,7 @@ def _possible_widths(
     return width, weight / weight.sum(axis=-2, keepdims=True)
 
 
-def widened(
-    std: Vector6, difference: Float64[np.ndarray, "*batch 6"], variance: Float64[np.ndarray, "*batch 6"]
-) -> Float64[np.ndarray, "*batch 6"]:
+def widened(std: Vector6, difference: Sixes, variance: Sixes) -> Sixes:
     """Standard deviation of a prior after comparison with what a log shows.
 
     `difference` is the bias that the log shows minus the prior's mean, `variance` that of the measurement (infinite where it

@@ -83,6 +83,12 @@ def measured(gyro: Vectors, accel: Vectors) -> Bool[np.ndarray, " n"]:
     return good
 
 
+def measured_rows(imu: Imu) -> Imu:
+    """Samples of an IMU that are a measurement; the IMU itself if all are."""
+    good = measured(imu.gyro, imu.accel)
+    return imu if good.all() else imu.rows(good)
+
+
 def measured_imu(imu: Imu, where: str, *, free_fall: bool = False) -> Imu:
     """Samples of an IMU that are a measurement; a warning counts the others.
 
