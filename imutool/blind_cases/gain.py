@@ -83,10 +83,9 @@ def explained_gain(
 ) -> float | None:
     """Share of the misfit's power over the noise that findings explain.
 
-    Their parameters have the catalogue's names.
-
-    At most 1; below 0 where they make it worse. None where an effect cannot be simulated, there is none, or what is concealed
-    acts within `EDGE_S` of the ends alone, as a limit that the first second reaches.
+    Their parameters have the catalogue's names. At most 1; below 0 where they make it worse. None where an effect cannot be
+    simulated, there is none, or what is concealed acts within `EDGE_S` of the ends alone, as a limit that the first second
+    reaches.
     """
     shown = [effect for effect in truth.effects if effect.effect not in WITHOUT_MISFIT]
     known = [_model(e.effect, e.driver, e.equation, {k: p.value for k, p in e.parameters.items()}) for e in shown]
@@ -143,9 +142,8 @@ def _scene(truth: ConcealedTruth, sim: Recording) -> Scene:
 def reported_gain(truth: ConcealedTruth, found: Findings, findings: Sequence[ReportedFinding]) -> float | None:
     """Reported share of the achievable reduction of the residual's power.
 
-    Signals weighted by their misfit over the noise.
-
-    Achievable is a reduction down to the recording's own noise: that of the simulation can be smoothed away.
+    Signals weighted by their misfit over the noise. Achievable is a reduction down to the recording's own noise: that of the
+    simulation can be smoothed away.
     """
     shares, weights = [], []
     for k, signal in enumerate(SIGNALS):

@@ -46,20 +46,16 @@ class LocationScore(Section, frozen=True):
 
 
 class ParameterScore(Section, frozen=True):
-    """Reported value of an identifiable parameter against the true one.
-
-    `sigmas`: error over the reported deviation; `percent`: error over the parameter's scale; `over_bound`: reported deviation
-    over the Cramér-Rao bound.
-    """
+    """Reported value of an identifiable parameter against the true one."""
 
     effect: str
     parameter: str
     true: float
     value: float
     std: float
-    sigmas: float | None
-    percent: float
-    over_bound: float | None
+    sigmas: float | None  # error over the reported deviation
+    percent: float  # error over the parameter's scale
+    over_bound: float | None  # reported deviation over the Cramér-Rao bound
 
 
 class Score(Report, frozen=True, kw_only=True, tag=SCHEMA):

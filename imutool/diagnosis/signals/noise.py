@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -143,18 +143,22 @@ def above_model_error(log: WhitenedLog, selection: Selection) -> tuple[Selection
 
 def _changes(log: WhitenedLog, selection: Selection, selected: SelectedEffect) -> Float64[np.ndarray, " k"]:
     """Deviation of what an effect adds to each column."""
-    chosen = selection.fitted.chosen
-    without = tuple(entry for entry in chosen if entry[0].key != selected.effect.key)
-    return np.asarray((with_effects(log.pair, chosen) - with_effects(log.pair, without)).std(axis=0))
+    without, complete = _models(log, selection, selected)
+    return np.asarray((complete - without).std(axis=0))
 
 
 def _sizes(log: WhitenedLog, selection: Selection, selected: SelectedEffect) -> Float64[np.ndarray, " k"]:
     """What an effect removes of each column, on held-out time."""
+    without, complete = _models(log, selection, selected)
+    gains = [held_out_rms([log], [without], [complete], name) for name in log.pair.signals]
+    return np.array([np.sqrt(max(gain.rms_before**2 - gain.rms_after**2, 0.0)) for gain in gains])
+
+
+def _models(log: WhitenedLog, selection: Selection, selected: SelectedEffect) -> Iterator[Float64[np.ndarray, "n k"]]:
+    """Expected samples without an effect, and with it."""
     chosen = selection.fitted.chosen
     without = tuple(entry for entry in chosen if entry[0].key != selected.effect.key)
-    before, after = ([with_effects(log.pair, these)] for these in (without, chosen))
-    gains = [held_out_rms([log], before, after, name) for name in log.pair.signals]
-    return np.array([np.sqrt(max(gain.rms_before**2 - gain.rms_after**2, 0.0)) for gain in gains])
+    return (with_effects(log.pair, these) for these in (without, chosen))
 
 
 def learnt_errors(log: WhitenedLog, found: Fit) -> dict[str, Float64[np.ndarray, " _"]]:

@@ -135,7 +135,7 @@ def _delays(ideal: IdealSignal, real: SignalSamples, turn_s: float) -> list[Thet
 def actuator_effects(scale: Scale) -> Iterator[Effect]:
     """Delay of all joints; gain, dead band and limit of each."""
     turn_s = min(size / slope for size, slope in zip(scale.size, scale.slope, strict=True))  # an effort turns by a radian
-    delay = scale.effect(
+    yield scale.effect(
         "actuator_delay",
         scale.columns,
         "the effort acts `delay` after it is commanded",
@@ -143,8 +143,8 @@ def actuator_effects(scale: Scale) -> Iterator[Effect]:
         _delayed,
         "the effort varies",
         stage=Stage.CLOCK,
+        starts=lambda ideal, real: _delays(ideal, real, turn_s),
     )
-    yield replace(delay, linear=False, starts=lambda ideal, real: _delays(ideal, real, turn_s))
     for k in scale.columns:
         yield from _of_joint(scale, k)
 
@@ -164,7 +164,7 @@ def _of_joint(scale: Scale, k: int) -> Iterator[Effect]:
         "the effort varies",
         starts=[np.ones(1)],
     )
-    dead_band = scale.effect(
+    yield scale.effect(
         "actuator_dead_band",
         (k,),
         "a command within +-width does nothing, and beyond it loses as much",
@@ -173,15 +173,15 @@ def _of_joint(scale: Scale, k: int) -> Iterator[Effect]:
         "the effort goes through zero",
         starts=[np.array([share * size]) for share in WIDTHS],
     )
-    limit = scale.effect(
+    yield scale.effect(
         "torque_saturation",
         (k,),
         "a command beyond +-limit acts as the limit",
         (Parameter("limit", unit, size, positive=True, step=0.01),),
         _Kept(k, scale.names[k], limits=True),
         "the effort goes beyond the limit",
+        starts=lambda ideal, real: _limits(real.y[:, k], real.x[:, k], size),
     )
-    yield from (dead_band, replace(limit, linear=False, starts=lambda ideal, real: _limits(real.y[:, k], real.x[:, k], size)))
 
 
 def _limits(commands: Samples, needed: Samples, size: float) -> list[Theta]:

@@ -8,7 +8,7 @@ Controlling mechanical systems with backlash, Automatica 38, 2002).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -90,18 +90,15 @@ def effects(scale: Scale) -> Iterator[Effect]:
         size, ripple = 0.5 * scale.size[k], _Ripple(k)
         waves = (Parameter("sine", scale.units[k], size), Parameter("cosine", scale.units[k], size))
         per_turn = Parameter("per_turn", "1/turn", MAX_TEETH, step=0.02, null_value=0.0)
-        yield Effect(
+        yield scale.effect(
             "gear_ripple",
-            Stage.SENSOR,
-            *_on(scale, k),
+            (k,),
             "effort += sine sin(per_turn q) + cosine cos(per_turn q)",
             (*waves, per_turn),
-            "the joint turns through several ripples",
             ripple,
-            linear=False,
+            "the joint turns through several ripples",
             starts=ripple.starts,
-            alternatives=_trials,
-            variant=scale.names[k] if len(scale.names) > 1 else "",
+            alternatives=lambda _: round(MAX_TEETH),
         )
         if scale.dynamics is None:
             continue
@@ -127,14 +124,6 @@ def effects(scale: Scale) -> Iterator[Effect]:
         )
 
 
-def _on(scale: Scale, k: int) -> tuple[Any]:
-    return (() if len(scale.names) == 1 else (scale.names[k],),)
-
-
-def _trials(_: Any) -> int:
-    return round(MAX_TEETH)
-
-
 # ── in the position ──
 
 
@@ -156,15 +145,15 @@ def _gaps(ideal: IdealSignal, real: Any) -> list[Theta]:
 def position_effects(scale: Scale) -> Iterator[Effect]:
     """Backlash, compliance and eccentricity of a joint whose position alone is compared."""
     size = scale.size[0]
-    backlash = scale.effect(
+    yield scale.effect(
         "backlash",
         (0,),
         "the position rests until the drive has crossed the gap",
         (Parameter("gap", scale.units[0], size, positive=True, step=0.02),),
         lambda s, theta: s.with_column(0, play(s.y[:, 0], theta[0])),
         "the joint turns both ways",
+        starts=_gaps,
     )
-    yield replace(backlash, linear=False, starts=_gaps)
     yield scale.effect(
         "eccentricity",
         (0,),

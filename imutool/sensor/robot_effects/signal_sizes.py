@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,14 +45,14 @@ class Scale:
         observable_if: str = "it varies",
         *,
         stage: Stage = Stage.SENSOR,
-        starts: list[Theta] | None = None,
+        starts: list[Theta] | Callable[[Any, Any], Sequence[Theta]] | None = None,
         variant: str = "",
         **more: Any,
     ) -> Effect:
         """Effect on some columns; linear without `starts`."""
         sensors = () if len(self.names) == 1 else tuple(self.names[k] for k in columns)
         label = ",".join([*(sensors if len(columns) < len(self.names) else ()), *([variant] if variant else [])])
-        given = None if starts is None else lambda ideal, real: starts
+        given = starts if starts is None or callable(starts) else lambda ideal, real: starts
         return Effect(
             name, stage, sensors, equation, parameters, observable_if, forward, starts is None, given, variant=label, **more
         )

@@ -74,9 +74,15 @@ def _of_low_pass(effect: Effect, *, exact: bool) -> list[Effect]:
 
 def analog(effect: Effect) -> Effect:
     """A low-pass without the rate of a digital one, of its lowest order."""
-    starts, kept = effect.starts, tuple(p for p in effect.parameters if p not in (RATE, ORDER, SMOOTHING))
-    assert starts is not None, "a low-pass has starts"
-    return replace(effect, parameters=kept, starts=lambda motion, at: [theta[: len(kept)] for theta in starts(motion, at)])
+    return _of_first(effect, sum(parameter not in (RATE, ORDER, SMOOTHING) for parameter in effect.parameters))
+
+
+def _of_first(effect: Effect, count: int) -> Effect:
+    """An effect of its first parameters alone; the others do nothing."""
+    starts = effect.starts
+    assert starts is not None, f"{effect.key} has starts"
+    kept = effect.parameters[:count]
+    return replace(effect, parameters=kept, starts=lambda motion, at: [theta[:count] for theta in starts(motion, at)])
 
 
 def of_order(first: Effect, order: float) -> Effect:
@@ -100,8 +106,7 @@ def _of_hysteresis(effect: Effect, *, exact: bool) -> list[Effect]:
     """A hysteresis of the whole reading, and with `exact` one of a share; another effect itself."""
     if SHARE not in effect.parameters:
         return [effect]
-    (sensor,), whole_starts = effect.sensors, effect.starts
-    assert whole_starts is not None, "a hysteresis has starts"
+    (sensor,) = effect.sensors
 
     def of_share(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
         """Widths of the size of the motion, and the share that each explains best."""
@@ -114,11 +119,8 @@ def _of_hysteresis(effect: Effect, *, exact: bool) -> list[Effect]:
             for width, lag in zip(widths, lags, strict=True)
         ]
 
-    whole = replace(
-        effect, parameters=effect.parameters[:1], starts=lambda motion, at: [theta[:1] for theta in whole_starts(motion, at)]
-    )
     of_part = f"share of h(t) and the rest of the ideal reading, h as {effect.equation}"
-    return [whole, *([replace(effect, variant=SHARED, equation=of_part, starts=of_share)] if exact else [])]
+    return [_of_first(effect, 1), *([replace(effect, variant=SHARED, equation=of_part, starts=of_share)] if exact else [])]
 
 
 def _of_dead_band(effect: Effect, *, exact: bool) -> list[Effect]:
@@ -148,11 +150,7 @@ def _of_resonance(effect: Effect, *, exact: bool) -> list[Effect]:
     """A resonance with its damper on the base, and with `exact` at rest; another effect itself."""
     if DAMPER not in effect.parameters:
         return [effect]
-    starts = effect.starts
-    assert starts is not None, "a resonance has starts"
-    on_base = replace(
-        effect, parameters=effect.parameters[:-1], starts=lambda motion, at: [theta[:-1] for theta in starts(motion, at)]
-    )
+    on_base = _of_first(effect, len(effect.parameters) - 1)
     at_rest = replace(
         on_base,
         variant="damper at rest",

@@ -181,8 +181,7 @@ class Trial:
         columns = [whole.logs[0].pair.signals[name] for name in effect.sensors if name not in larger]
         if not columns:
             return False
-        others = tuple(entry for entry in whole.chosen if entry[0] is not effect)
-        gained = axis_squares(fit(whole.logs, others, part=whole.part, near=whole)) - axis_squares(whole)
+        gained = axis_squares(_without(effect, whole)) - axis_squares(whole)
         return self.candidates.log_p(effect, float(sum(gained[part].sum() for part in columns))) < self.threshold
 
     def _is_contradicted(self, effect: Effect, whole: Fit) -> bool:
@@ -190,8 +189,7 @@ class Trial:
         parts = [part for name, part in whole.logs[0].pair.signals.items() if name in effect.sensors]
         if len(parts) < 2:
             return False
-        others = tuple(entry for entry in whole.chosen if entry[0] is not effect)
-        gained = axis_squares(fit(whole.logs, others, part=whole.part, near=whole)) - axis_squares(whole)
+        gained = axis_squares(_without(effect, whole)) - axis_squares(whole)
         each = [float(gained[part].sum()) for part in parts]
         lost = -min(each)
         return lost > self.settings.contradicted_share * max(each) and self.candidates.log_p(effect, lost) < self.threshold
@@ -200,9 +198,7 @@ class Trial:
         """Whether an effect of a fit may be the error of its low-pass."""
         if (error := LowPassError.of(whole)) is None or not of_motion(effect):
             return False
-        others = tuple(entry for entry in whole.chosen if entry[0] is not effect)
-        without, log_p = fit(whole.logs, others, part=whole.part, near=whole), partial(self.candidates.log_p, effect)
-        return error.may_be(effect, without, whole, log_p, self.threshold)
+        return error.may_be(effect, _without(effect, whole), whole, partial(self.candidates.log_p, effect), self.threshold)
 
     def _verdict(self, k: int, gain: tuple[float, float], whole: Fit, scattered: Scatter | None) -> SelectedEffect | None:
         """Verdict on one effect by all rows; none if chance explains it or it is no answer."""
@@ -233,6 +229,12 @@ class Trial:
         std = np.hypot(np.hypot(std, self.walk_std.get(effect.key, 0.0)), self.order_std.get(effect.key, 0.0))
         vague = tuple(unidentified(effect, theta, std, curve=curve))
         return SelectedEffect(effect, theta, std, vague, float(np.exp(max(log_p, -700))), rate, gain[0]) if rate < 1.0 else None
+
+
+def _without(effect: Effect, whole: Fit) -> Fit:
+    """Fit of all effects but one."""
+    others = tuple(entry for entry in whole.chosen if entry[0] is not effect)
+    return fit(whole.logs, others, part=whole.part, near=whole)
 
 
 def _off_other_peaks(whole: Fit, k: int, inflation: float) -> Theta:
