@@ -14,10 +14,7 @@ from imutool.units import COLUMNS
 
 
 class EffectsStream:
-    """Bias stream: effects, then the neural ODE on the corrected samples.
-
-    `load` is that before the first sample.
-    """
+    """Bias stream: effects, then the neural ODE on the corrected samples."""
 
     def __init__(
         self,

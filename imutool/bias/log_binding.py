@@ -128,10 +128,7 @@ class TemperatureDrift:
 
 
 class OnlineDrift:
-    """Drift of a model's bias in a live stream, as `TemperatureDrift` has it.
-
-    It is zero before the first temperature.
-    """
+    """Drift of a model's bias in a live stream; zero before the first temperature."""
 
     def __init__(self, model: BiasModel) -> None:
         scale = scale_of(model)

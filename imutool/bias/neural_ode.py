@@ -249,10 +249,7 @@ def _perceptron_slope(layers: list[tuple[Array, Array]], x: Array, J: Array) -> 
 
 
 class PaperStream:
-    """Bias stream of the paper's scheme.
-
-    By Euler from sample to sample, with the field at the sample before.
-    """
+    """Bias stream of the paper's scheme, by Euler, with the field at the sample before."""
 
     def __init__(self, drifts: Mapping[Sensor, Drift], rest: Vector6, rate_hz: float) -> None:
         self._drifts, self.rest, self._rate_hz = drifts, rest.astype(np.float64), rate_hz

@@ -37,10 +37,7 @@ Roots = Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]
 
 
 class EstimateParts(NamedTuple):
-    """Bias, covariance of its rest bias, and roots of the calibration covariance.
-
-    `bias.model.CovarianceModel`.
-    """
+    """Bias, covariance of its rest bias, and roots of the calibration covariance."""
 
     bias: Rows6
     rest: Covariances
@@ -48,10 +45,7 @@ class EstimateParts(NamedTuple):
 
 
 class BiasEstimator:
-    """Bias with its covariance, gyro (rad/s) then accel (m/s²).
-
-    For samples as they arrive in blocks of any size.
-    """
+    """Bias with its covariance, gyro (rad/s) then accel (m/s²), for samples that arrive in blocks."""
 
     def __init__(self, model: BiasModel, start: InitialBias) -> None:
         self._rest, self._calibration = start.estimator(model), model.calibration_covariance()

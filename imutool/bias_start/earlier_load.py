@@ -88,10 +88,7 @@ def after_load(model: BiasModel, load: Load | None) -> BiasModel:
 
 
 def _log_likelihood(models: Sequence[BiasModel], samples: Samples, first_ns: int | None) -> Float64[np.ndarray, " t"]:
-    """Log-likelihood of the rest bias, of the velocity and of what the gyro reads at rest, half second by half second.
-
-    The models are one after different loads.
-    """
+    """Log-likelihood, by model, of the rest bias, of the velocity and of what the gyro reads at rest."""
     prior = bias_prior(models[0], first_ns)
     without = [without_motion(model, samples, prior.mean) for model in models]
     found, out = filter_together([BiasFilter(prior, ahead=True) for _ in models], without), []

@@ -87,10 +87,7 @@ class _Evidence:
 
 
 def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], about: Mapping[str, str]) -> Fitness:
-    """Fitness of a model, started in a log, for up to `CHECKED_S` seconds of its samples.
-
-    `about` is what the log says of its origin: `sensor`, `dataset`.
-    """
+    """Fitness of a model for up to `CHECKED_S` of a log; `about` is its sensor and dataset, if known."""
     samples = head(batches)
     if len(samples[0]) and (wrong := unusual_gravity(samples[2], start.rest[3:])):
         return Fitness("unfit", (wrong,))

@@ -175,10 +175,7 @@ def prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
 
 
 def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
-    """Prior of the bias filter from the training runs.
-
-    The axes of a sensor share one random walk.
-    """
+    """Prior of the bias filter from the training runs; the axes of a sensor share one random walk."""
     start = prior(model, first_ns)
     ground = np.maximum(model.rest_std, AT_REST_STD)
     walk = np.repeat(np.sqrt(np.mean(model.walk_std.reshape(2, 3) ** 2, axis=1)), 3)

@@ -224,10 +224,7 @@ def _imu_batches(
 
 @dataclass(frozen=True)
 class _Batches:
-    """IMU samples with seconds since the first, without the model's drift.
-
-    Every iteration reads the log again.
-    """
+    """IMU samples with seconds since the first, without the model's drift, read from the log each time."""
 
     log: Log
     topic: str

@@ -199,10 +199,7 @@ def location(misfit: Rows6, sigma: Theta) -> Location:
 
 
 def achievable_rms(misfit: Rows6, sigma: Theta) -> dict[str, Rms]:
-    """Root mean square of real minus simulated samples by sensor, bias removed.
-
-    It has two values: of misfit and noise together, and of the noise alone.
-    """
+    """RMS of real minus simulated samples by sensor without the bias: misfit and noise, noise alone."""
     misfit = misfit - misfit.mean(axis=0)
     found = {}
     for name, part in (("gyro", GYRO), ("accel", ACCEL)):

@@ -45,10 +45,7 @@ class Stage(IntEnum):
 
 @dataclass(frozen=True)
 class Parameter:
-    """Parameter of a model.
-
-    An `amount` grows with the size of the effect, a time or a frequency does not.
-    """
+    """Parameter of a model; an `amount` grows with the size of the effect, a time or frequency does not."""
 
     name: str
     unit: str
@@ -58,10 +55,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Reading:
-    """Input of a SENSOR model.
-
-    Seconds since the log's start, the signal, and the log's other channels.
-    """
+    """Input of a SENSOR model: seconds since the log's start, the signal, and the log's other channels."""
 
     t_s: Times
     signal: Rows6
@@ -139,10 +133,7 @@ def gravity(ideal: Kinematics, theta: Theta) -> Rows6:
 
 
 def earth_rotation(ideal: Kinematics, theta: Theta) -> Rows6:
-    """omega_e (cos lat cos heading, cos lat sin heading, sin lat) in the world, z up.
-
-    North is at `heading` about z from x.
-    """
+    """omega_e, level and up, in the world, z up; north is at `heading` about z from x."""
     latitude, heading = theta
     level = np.cos(latitude)
     omega_w = EARTH_RAD_S * np.array([level * np.cos(heading), level * np.sin(heading), np.sin(latitude)])
@@ -208,10 +199,7 @@ def first_order(signal: Columns, rate_hz: float, cut_off_hz: float) -> Columns:
 
 
 def spring_mount(signal: Columns, rate_hz: float, f0_hz: float, zeta: float) -> Columns:
-    """Acceleration on a spring and damper.
-
-    H = (2 zeta w s + w²) / (s² + 2 zeta w s + w²) of the base's.
-    """
+    """Acceleration on a spring and damper: H = (2 zeta w s + w²) / (s² + 2 zeta w s + w²) of the base's."""
     w = 2.0 * np.pi * f0_hz
     return _filtered(signal, rate_hz, [2.0 * zeta * w, w * w], [1.0, 2.0 * zeta * w, w * w])
 

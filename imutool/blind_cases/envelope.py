@@ -50,10 +50,7 @@ class Rms(Section, frozen=True):
 
 
 class TrueParameter(Section, frozen=True):
-    """True value of a parameter, its scale, and the smallest standard deviation of an estimate.
-
-    The smallest deviation is None where there is no bound.
-    """
+    """True value of a parameter, its scale, and the smallest possible deviation of an estimate, if any."""
 
     value: float
     unit: str

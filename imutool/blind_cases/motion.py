@@ -31,10 +31,7 @@ Knots = Float64[np.ndarray, " m"]
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """Rate omega (rad/s), its derivative alpha and specific force f (m/s²) in the body frame.
-
-    f = R_wb^T (a_w - g_w).
-    """
+    """Rate omega (rad/s), derivative alpha and specific force f = R_wb^T (a_w - g_w), in the body frame."""
 
     t_s: Times
     omega: Vectors
@@ -45,10 +42,7 @@ class Kinematics:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Splines of position (m) and of a multiple of q_wb (wxyz).
-
-    Valid from `first_s` to `last_s`.
-    """
+    """Splines of position (m) and a multiple of q_wb (wxyz), valid from `first_s` to `last_s`."""
 
     position: BSpline
     quaternion: BSpline

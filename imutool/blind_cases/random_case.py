@@ -135,10 +135,7 @@ def _candidates(seen: Detectability, rng: Generator, kind: str, effects: Sequenc
 
 
 def sized(seen: Detectability, model: Model, theta: Theta, size: Size) -> tuple[Theta, float] | None:
-    """Parameters at a size, and its ratio to the plausible one.
-
-    None where the motion does not show it.
-    """
+    """Parameters at a size, and its ratio to the plausible one; None where the motion does not show it."""
     ideal = seen.scene.ideal(seen.t_s)
     fixed = size == "small" and model.name in FIXED_SMALL
     factor = FIXED_SMALL[model.name] if fixed else FACTOR.get(size, 1.0)

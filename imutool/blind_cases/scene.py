@@ -33,10 +33,7 @@ Acting = Sequence[tuple[Model, Theta]]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Motion, noise and channels of a case; seconds count from the log's start.
-
-    `noise` is the standard deviation of a real sample, by column.
-    """
+    """Motion, noise (by column) and channels of a case; seconds count from the log's start."""
 
     smoother: Smoother
     motion: Motion

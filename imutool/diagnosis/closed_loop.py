@@ -46,10 +46,7 @@ def closed_loop(
     metric: tuple[float, float] | None = None,
     rounds: int = 1,
 ) -> ClosedLoop:
-    """Figures of a recording and two simulations: the given one, and one with found physics.
-
-    `metric` is the user's figure of both (`figure`).
-    """
+    """Figures of a recording and two simulations, the second with found physics; the user's `metric`."""
     other = ANOTHER_MOTION in second.remarks and ANOTHER_MOTION not in first.remarks  # then its figures are of other poses
     compared = [] if other else [*_compared(_shared(first, second))]
     if metric is not None:

@@ -118,10 +118,7 @@ def _beside_reference(
     report: NamedProgress = silent,
     begin: Sequence[Finding] = (),
 ) -> tuple[Diagnosis, Selection | None]:
-    """Diagnosis of recordings against a simulation or their own poses; `remarks_read` are those of reading them.
-
-    The selection of effects comes with it; none without a reference.
-    """
+    """Diagnosis beside a simulation or own poses, and the effects selected (None without a reference)."""
     reals, sim, imu, truth, signals, settings = asked
     simulated = None if sim is None else read_simulation(sim, imu=imu_in(sim, imu))[0]
     warn_of_recordings([] if simulated is None else [simulated])

@@ -63,13 +63,10 @@ class HeldOut(Section, frozen=True):
 
 
 class Closer(HeldOut, frozen=True):
-    """Held-out residual before and after all findings; `share` of the misfit's power is removed.
+    """Held-out residual before and after all findings."""
 
-    `share` is None where there was no misfit; `by` says whether a second simulation or the estimator gave the residual after.
-    """
-
-    share: float | None = None
-    by: Literal["second simulation", "computed"] = "computed"
+    share: float | None = None  # of the misfit's power that is removed; None without a misfit
+    by: Literal["second simulation", "computed"] = "computed"  # what gave the residual after
 
     @classmethod
     def computed(cls, held_out: HeldOut, noise_floor: float) -> Closer:

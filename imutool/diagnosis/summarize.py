@@ -54,10 +54,7 @@ def summarize(
     sim_findings: Sequence[Finding],
     hidden: Sequence[str],
 ) -> Diagnosis:
-    """Summarize selected effects as a diagnosis; findings shared with a simulation are left out.
-
-    `reals` are paths by the name of a log, `hidden` the unobservable parameters of the catalogue.
-    """
+    """Diagnosis from selected effects, paths by the name of a log, and unobservable parameters."""
     pairs, noise = [log.pair for log in logs], noise_floor(logs)
     exact = all(pair.exact for pair in pairs)
     sample = noise if exact else np.asarray(np.median([white_noise(pair.real) for pair in pairs], axis=0))

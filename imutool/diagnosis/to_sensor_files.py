@@ -56,10 +56,7 @@ def _started(effect: Effect, parameters: Mapping[str, Estimate]) -> tuple[Effect
 
 
 def to_physics_file(d: Diagnosis) -> PhysicsFile:
-    """Physics file with the findings, and the constant bias of the first log if known.
-
-    The values of a curve are about its mean, which is added to the bias.
-    """
+    """Physics file with the findings and, if known, the first log's bias, to which curves add a mean."""
     entries, curves, terms = [], [], []
     bias = np.array(d.bias[0], dtype=np.float64)
     for finding in d.findings:

@@ -211,10 +211,7 @@ class Remembered:
 
 
 def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Vectors, Vectors]:
-    """Residual: samples minus the ideal ones at the same stamps, gyro (rad/s) and accel (m/s²).
-
-    Good enough to start a fit from.
-    """
+    """Samples minus the ideal ones at the same stamps, to start a fit from: gyro (rad/s), accel (m/s²)."""
     ideal = motion.sample(samples.stamp_s, samples.stamp_s)
     return samples.gyro - ideal.gyro, samples.accel - ideal.accel
 

@@ -159,10 +159,7 @@ class SimulatedSensor(NamedTuple):
 
 
 def additive_noise(noise: datasheet.Noise, rate_hz: float, seed: int) -> Effect:
-    """Effect of white noise and a walking bias, each from its own stream.
-
-    Unknown densities are zero.
-    """
+    """White noise and a walking bias, each from its own stream; unknown densities are zero."""
     densities = {name: np.nan_to_num(noise.values(name)) for name in datasheet.UNITS}
     colour = noise.colour if noise.colour is not None and noise.colour.holds_at(rate_hz) else None
 

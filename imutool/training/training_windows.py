@@ -165,10 +165,7 @@ class Pool:
         return first[keep]
 
     def around(self, first: Int[Tensor, " batch"], before: int, after: int) -> Int[Tensor, "batch _"]:
-        """Indices from `before` samples before some samples to `after` samples after them.
-
-        They stay in the log of the first: before its beginning its first sample repeats, after its end its last.
-        """
+        """Indices from `before` to `after` samples about some; the first and last of their log repeat."""
         log = self.log[first]
         begin, end = torch.searchsorted(self.log, log), torch.searchsorted(self.log, log, right=True) - 1
         index = first[:, None] + torch.arange(-before, after + 1, device=first.device)
@@ -228,10 +225,7 @@ def corrected(
 
 
 def without_motion(model: BiasNetwork, pool: Pool) -> Pool:
-    """Pool without what a model adds to its prior.
-
-    As `imutool.bias_start.bias_tracking` takes it off.
-    """
+    """Pool without what a model adds to its prior, as in `bias_start.bias_tracking`."""
     inference, samples = model.frozen(), torch.cat([pool.gyro, pool.accel], dim=1)
     start, residual = inference.prior_mean, samples.clone()
     for log in range(len(pool.names)):

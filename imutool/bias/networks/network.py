@@ -22,10 +22,7 @@ from imutool.units import COLUMNS, SENSORS, Sensor
 
 @dataclass(frozen=True)
 class Segment:
-    """Samples of a segment.
-
-    `t` in seconds from its first sample, and the rest bias at its start.
-    """
+    """Samples of a segment, `t` (s) from its first sample, and the rest bias at its start."""
 
     t: Float[Tensor, "batch n"]
     gyro: Float[Tensor, "batch n 3"]

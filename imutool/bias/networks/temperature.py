@@ -69,10 +69,7 @@ def temperature_terms(recording: Recording, scale: Scale) -> Float64[np.ndarray,
 
 
 def log_signals(recording: Recording, rate_hz: float, scale: Scale | None, load: Load | None) -> Signals:
-    """Signals of a whole log, with the terms of its temperature.
-
-    `load` is that before its first sample.
-    """
+    """Signals of a whole log, with a load before it, and with the terms of its temperature."""
     imu = recording.imu
     found = SignalFilter(rate_hz, load=load)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
     return found if scale is None else Signals(found.t_s, found.columns, temperature_terms(recording, scale))
@@ -85,10 +82,7 @@ def online_signals(
     scale: Scale | None,
     loads: Sequence[Load | None],
 ) -> Signals:
-    """Signals of so many samples of each log from its first true pose on.
-
-    Filters and time start where the log does. `loads` are those before each log.
-    """
+    """Signals of `counts` samples of each log from its first true pose on; its load is before the log."""
     parts: list[Signals] = []
     for recording, count, load in zip(recordings, counts, loads, strict=True):
         first = int(np.searchsorted(recording.imu.t_ns, recording.overlap().imu.t_ns[0]))

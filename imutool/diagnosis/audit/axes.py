@@ -34,14 +34,11 @@ PERMUTATIONS = sorted(  # all 48 signed permutations, those that change fewest a
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """Parts of a motion in each frame, the right one first, of which a signal may be made.
-
-    Its bias is free, or at most `MAX_BIAS`. With `turns` its axes may be turned, too.
-    """
+    """Parts of a motion in each frame, the right one first, of which a signal may be made."""
 
     frames: Mapping[str, Parts]
-    free_bias: bool
-    turns: bool
+    free_bias: bool  # or at most `MAX_BIAS`
+    turns: bool  # its axes may be turned, too
 
     def frame(self, y: Vectors) -> tuple[str, Matrix]:
         """Frame of a signal, and its axes P: the simplest that explains as much as any."""
@@ -60,10 +57,7 @@ class Hypotheses:
         return other if turned < CLEARLY * min(as_read, 1.0) else 1.0
 
     def _squares(self, y: Vectors, *, scaled: bool = False) -> list[tuple[float, int, str, Matrix]]:
-        """What each frame and P leaves of a signal, with its rank: the ideal sensor is the first.
-
-        The motion may be `scaled`, as that of another clock is.
-        """
+        """What each frame and P leaves of a signal, with its rank: the ideal sensor is the first."""
         out: list[tuple[float, int, str, Matrix]] = []
         tried = [(frame, x, PERMUTATIONS) for frame, x in self.frames.items()]
         if self.turns:

@@ -54,10 +54,7 @@ def _is_mean(residual: Vectors, rate: Vectors, t_s: Float64[np.ndarray, " n"], l
 
 
 def max_filter_delay(residual: Vectors, samples: Float64[np.ndarray, "m 3"]) -> float:
-    """Most delay (sample periods) of a filter that the noise shows; 0 for white noise.
-
-    Quartiles of short segments are those between two impacts.
-    """
+    """Most delay (sample periods) of a filter that the noise shows; 0 for white noise."""
     both = []
     for x in (residual, samples):
         f, _, parts = spectrogram(x, 1.0, window="hann", nperseg=min(SHORT, len(x)), axis=0)

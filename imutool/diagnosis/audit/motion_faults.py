@@ -35,10 +35,7 @@ def motion_faults(k: Kinematics, fit: KinematicFit, filters: tuple[float, float]
 
 
 def unexplained(k: Kinematics, fit: KinematicFit, faults: Sequence[FaultFound]) -> dict[str, float]:
-    """Large shares of the sensors' motions that neither poses nor a fault nor noise explain.
-
-    A share is one of the root mean square; medians are those between impacts.
-    """
+    """Large shares (of the rms) of sensors' motions that neither poses nor a fault nor noise explain."""
     scaled = {fault.fault for fault in faults} & {"other_clock", "gravity_only"}
     out: dict[str, float] = {}
     for sensor, samples, name in (("gyro", k.gyro, "scale"), ("accel", k.accel, "m")):

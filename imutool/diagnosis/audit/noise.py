@@ -122,10 +122,7 @@ def _between_impacts(x: Float64[np.ndarray, "n k"], size: int) -> Column:
 def noise_faults(
     imu: Imu, residual: Rows6, expected: list[Expected], lines: Sequence[SpectralLine] = ()
 ) -> tuple[list[FaultFound], list[SpectralLine]]:
-    """Faults of the noise, and lines of unknown cause.
-
-    `residual` is what the motion leaves of the samples.
-    """
+    """Faults of the noise, and lines of unknown cause, in what the motion leaves of the samples."""
     rate_hz, samples = 1.0 / imu.period_s, np.concatenate([imu.gyro, imu.accel], axis=1)
     out = [
         found("step_lines", line.sensor, f=Estimate(line.f_hz, line.width_hz, "Hz")) for line in lines if line.cause == "sensor"

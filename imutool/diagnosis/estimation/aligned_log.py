@@ -205,10 +205,7 @@ class Pair(AlignedLog):
 def split(
     stamp_s: Float64[np.ndarray, " n"], settings: SplitSettings = DEFAULT.split
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Held-out rows, and usable rows.
-
-    Usable rows are away from gaps and from borders between fitted and held-out blocks.
-    """
+    """Held-out rows; and usable ones, away from gaps and from borders of held-out blocks."""
     each, margin_s = settings.held_out_each, settings.margin_s
     since = stamp_s - stamp_s[0]
     block_s = max(settings.block_s, settings.block_samples * float(np.median(np.diff(stamp_s))))

@@ -103,10 +103,7 @@ class CandidateScore:
         return _Linear(start, rows, N)
 
     def gain(self, effect: Effect, linear: _Linear) -> float:
-        """Gain in squares of one linear step from a start.
-
-        No positive parameter changes by more than a factor of e.
-        """
+        """Gain in squares of one linear step; no positive parameter changes by more than a factor of e."""
         p = len(linear.start)
         N_ab, g_b, g_a, total = np.zeros((len(self.N), p)), np.zeros(p), self.g, self.total
         for k, js, b, added in linear.rows:

@@ -39,15 +39,12 @@ _objective = attrgetter("objective")
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Fitted effects with parameters and biases, and the objective of the fit.
-
-    The objective is the sum of squares of white residuals and of the prior, `numbers` the count of fitted white values.
-    """
+    """Fitted effects with parameters and biases, and the objective of the fit."""
 
     chosen: Chosen
     bias: Float64[np.ndarray, "logs k"]
-    objective: float
-    numbers: int
+    objective: float  # squares of white residuals and of the prior
+    numbers: int  # of fitted white values
     logs: tuple[WhitenedLog, ...]
     part: str
     passes: tuple[ForwardPass, ...]

@@ -41,10 +41,7 @@ SPREAD = 1e-9  # relative: knots that lie closer are one
 
 
 def driven(pairs: Sequence[Pair]) -> Iterator[Effect]:
-    """Effects driven by each other channel of the logs, on one of the sensors.
-
-    + gain * channel, taken some time earlier.
-    """
+    """Effects of each other channel of the logs, some time earlier, on one of the sensors."""
     named = {need for effect in catalogue.diagnosed() for need in effect.needs}
     for name in sorted(set.intersection(*(set(pair.channels) for pair in pairs))):
         size = float(np.std(np.concatenate([pair.channels[name] for pair in pairs])))
@@ -133,10 +130,7 @@ def _curve(variable: str, sensor: int, axis: int, splines: SplineBasis) -> Effec
 
 
 class Curve(AddedColumns, SplineCurve):
-    """+ a spline of one variable on one axis of an IMU.
-
-    Curves of one variable share their splines.
-    """
+    """+ a spline of one variable on one axis of an IMU; curves of one variable share their splines."""
 
     def __init__(self, variable: str, sensor: int, axis: int, splines: SplineBasis) -> None:
         super().__init__(variable, unit(variable), splines.inner, columns=len(AXES), axis=axis)

@@ -31,10 +31,7 @@ FORGOTTEN = 1e-12  # of the noise: its square would underflow
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """Low-pass band of a signal, decimated.
-
-    Smoothed poses know nothing of what is faster.
-    """
+    """Low-pass band of a signal, decimated: smoothed poses know nothing of what is faster."""
 
     taps: Float64[np.ndarray, " k"]
     every: int

@@ -28,10 +28,7 @@ CONSTANT = 0.1  # of the squares of the specific force: a bias and a tilt leave 
 
 
 def with_common_conventions(pairs: Sequence[Pair], of: str = "simulation") -> tuple[list[Pair], list[Finding]]:
-    """Recordings in the units and axes of their reference, and findings of those that differ.
-
-    `of` is what the reference is called.
-    """
+    """Recordings in the units and axes of their reference (`of`), and findings of those that differ."""
     shown: dict[Sensor, _Convention] = {}
     for sensor in SENSORS:
         part = COLUMNS[sensor]

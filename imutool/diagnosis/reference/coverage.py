@@ -240,10 +240,7 @@ def without_unusable(pair: Pair) -> Pair:
 
 
 def check_without_reference(real: Recording, path: str, why: str, settings: DiagnoseSettings) -> Diagnosis:
-    """Diagnosis without a reference, for the reason `why`: gaps, quantization, saturation.
-
-    The constant bias is not known either (NaN).
-    """
+    """Diagnosis of stamps and digits alone, for the reason `why`; the constant bias is NaN."""
     stamp_s = seconds(real.imu.t_ns, int(real.imu.t_ns[0]))
     samples, no_rows = np.concatenate([real.imu.gyro, real.imu.accel], axis=1), np.zeros(len(stamp_s), bool)
     no_motion = IdealMotion(stamp_s, *np.zeros((3, len(stamp_s), 3)))

@@ -77,10 +77,7 @@ def band_hz(stretch: Stretch, settings: ReferenceSettings) -> float:
 
 
 def is_in_raw_poses(pair: Pair, line: Rows6, f_hz: float) -> bool:
-    """Whether the poses have a spectral line before smoothing: it is motion of the body.
-
-    They have none above half of their rate.
-    """
+    """Whether the poses have a spectral line before smoothing, so that it is motion of the body."""
     if pair.truth is None or not pair.truth.has_positions or f_hz > 0.5 * pair.poses_hz:
         return False
     shown, _ = by_differences(pair.truth, np.zeros(3))

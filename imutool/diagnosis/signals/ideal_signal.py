@@ -285,8 +285,5 @@ def _resampled(t_s: Column, values: Column, at_s: Column) -> Column:
 
 
 def _jumps(values: Column) -> bool:
-    """Whether a signal holds still for most samples, as a command does.
-
-    A spline would ring about its steps.
-    """
+    """Whether a signal holds still for most samples, as a command does: a spline would ring."""
     return float((np.diff(values) == 0.0).mean()) > 0.5

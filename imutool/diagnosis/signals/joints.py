@@ -43,10 +43,7 @@ def joint_names(log: Log, topic: str) -> list[list[str]]:
 
 
 def by_joint(fields: Mapping[str, Fields], wanted: Sequence[str], given: Sequence[str]) -> dict[str, Fields]:
-    """Fields under the indices that another log gives the same joints.
-
-    Where no name is in both logs, the order decides.
-    """
+    """Fields under the indices of the same joints in another log: by name, or else by order."""
     index = {f"[{given.index(name)}]": f"[{k}]" for k, name in enumerate(wanted) if name in given}
     if not index:
         return dict(fields)
@@ -70,10 +67,7 @@ def joint_remarks(topic: str, real: Sequence[str], sim: Sequence[str]) -> list[s
 def joint_pairs(
     topic: str, real: Mapping[str, Fields], sim: Mapping[str, Fields], wheels: Collection[str]
 ) -> Iterator[SignalPair]:
-    """Efforts with the motion of the joints where both logs have both, else each number alone.
-
-    `wheels` are indices of joints that are compared with the vehicle.
-    """
+    """Efforts with the motion of the joints (but `wheels`) where both logs have both, else each number."""
     both = [path for path in sim if path in real and not path.endswith(tuple(wheels))]  # in the order of the model
     joints = [path.removeprefix("position") for path in both if path.startswith("position")]
     driven = [k for k in joints if f"effort{k}" in both]

@@ -112,10 +112,7 @@ def rich_residual(pair: AlignedSignal, column: int) -> Float64[np.ndarray, " n"]
 
 
 def lsb_of(pair: SignalPair, settings: DiagnoseSettings) -> list[float]:
-    """Quantization step of recorded values, by column.
-
-    0 where they lie on no grid, or the simulation's lie on the same.
-    """
+    """Quantization step of recorded values, by column; 0 without a grid of their own."""
     steps = []
     for real, sim in zip(pair.real.T, pair.sim.T, strict=True):
         step, simulated = (grid(values, settings.timestamps) for values in (real, sim))

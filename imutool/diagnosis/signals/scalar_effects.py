@@ -82,10 +82,7 @@ def _of_lag(lag_s: float) -> list[float]:
 
 
 def _low_pass(ideal: IdealSignal, theta: Theta) -> IdealSignal:
-    """First-order lag, exact for straight lines between fine samples.
-
-    The first value holds before the start.
-    """
+    """First-order lag, exact for straight lines between fine samples; it starts settled."""
     a = 2.0 * np.pi * min(float(theta[0]), 1e3 * ideal.rate_hz) / ideal.rate_hz  # rad a sample
     e = np.exp(-a)
     b = [1.0 - (1.0 - e) / a, (1.0 - e) / a - e]
@@ -223,10 +220,7 @@ class _Driven:
 
 
 def driven(signal: AlignedSignal) -> Iterator[Effect]:
-    """Effects driven by each other channel, on one column or on a vector as a whole.
-
-    A copy of a column drives nothing.
-    """
+    """Effects of each other channel that is no copy, on one column or on a vector as a whole."""
     parts = [range(signal.columns)] if signal.kind in VECTORS else [range(k, k + 1) for k in range(signal.columns)]
     for name, (t_s, values) in sorted(signal.ideal.channels.items()):
         channel = np.interp(signal.stamp_s, t_s, values)

@@ -146,10 +146,7 @@ def improvement(closer: Closer) -> str:
 
 
 def location_text(place: Located, d: Diagnosis | None = None) -> str:
-    """Location as text: `accel x, y, angular rate above 0.4 rad/s, 12.0 to 48.5 s`.
-
-    `d` gives logs the names of its figures.
-    """
+    """Location as text: `accel x, y, angular rate above 0.4 rad/s, 12.0 to 48.5 s`."""
     names = {trace.path: trace.log for trace in d.traces if trace.path} if d is not None else {}
     spans = [f"{first:.1f} to {last:.1f} s" for first, last in place.intervals_s]
     shown = spans if len(spans) <= SHOWN else [*spans[: SHOWN - 1], f"{len(spans) - SHOWN + 1} more stretches"]

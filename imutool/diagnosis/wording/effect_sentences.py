@@ -14,14 +14,11 @@ from imutool.recording import GRAVITY_M_S2
 
 @dataclass(frozen=True)
 class Words:
-    """Words of a sentence: pronoun of the signal, name of the reference, quantities.
+    """Words of a sentence: pronoun of the signal, name of the reference, quantities."""
 
-    it: the pronoun; other: the reference; by_poses: whether that is true poses; main: the first quantity; rest: the others.
-    """
-
-    it: str
-    other: str
-    by_poses: bool
+    it: str  # pronoun of the signal
+    other: str  # name of the reference
+    by_poses: bool  # whether that is true poses
     main: Quantity
     rest: tuple[Quantity, ...]
     finding: Finding

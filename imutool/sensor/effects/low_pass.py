@@ -188,12 +188,9 @@ class _Gain(NamedTuple):
 
 
 class Filter(NamedTuple):
-    """Filter of samples N / D in powers of 1/z.
+    """Filter of samples N / D in powers of 1/z."""
 
-    The first tap of N is for the sample `AHEAD` samples later.
-    """
-
-    taps: Float64[np.ndarray, " _"]
+    taps: Float64[np.ndarray, " _"]  # the first is for the sample `AHEAD` samples later
     denominator: Float64[np.ndarray, " d"]
 
     @classmethod

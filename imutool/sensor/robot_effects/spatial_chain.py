@@ -32,10 +32,7 @@ Cost = Callable[[Axes], float]
 
 @dataclass(frozen=True, eq=False)
 class SpatialChain:
-    """Axes of the joints from base to tip.
-
-    They are as they point where all angles are zero; the third direction is up.
-    """
+    """Axes of the joints from base to tip where all angles are zero; the third direction is up."""
 
     axes: Axes
 

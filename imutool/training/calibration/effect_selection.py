@@ -199,16 +199,13 @@ def _unseen(effects: Sequence[LinearForm], problem: Problem, covariance: Float[T
 
 @dataclass(frozen=True)
 class PhysicsFirst:
-    """Hybrid model with fitted effects, and the recordings corrected for them.
-
-    `loads` are those before each recording.
-    """
+    """Hybrid model with fitted effects, and the recordings corrected for them."""
 
     model: hybrid.Network
     fits: dict[Sensor, Calibration]
     recordings: list[Recording]
     scale: temperature.Scale | None
-    loads: Sequence[Load | None]
+    loads: Sequence[Load | None]  # before each recording
 
     @classmethod
     def of(

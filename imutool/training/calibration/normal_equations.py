@@ -69,14 +69,11 @@ class Seen(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """Errors that are linear in parameters theta, the product of `pattern` and the values.
-
-    `prior` is one over the variance of each parameter, about zero.
-    """
+    """Errors that are linear in parameters theta, the product of `pattern` and the values."""
 
     values: Float[Tensor, "n q"]
     pattern: Float[Tensor, "3 q p"]
-    prior: Float[Tensor, " p"]
+    prior: Float[Tensor, " p"]  # one over the variance of each parameter, about zero
 
     @classmethod
     def of(cls, effects: Sequence[LinearForm], signals: Signals, sensors: SensorPrior, pool: Pool) -> Terms:

@@ -149,10 +149,7 @@ def _velocity(
 
 
 def products(steps: Float[Tensor, "batch n 3 3"], n: int) -> Float[Tensor, "batch m 3 3"]:
-    """All products of n consecutive rotations, by doubling.
-
-    `steps[k] @ ... @ steps[k + n - 1]` for every k that has them.
-    """
+    """All products `steps[k] @ ... @ steps[k + n - 1]` of n consecutive rotations, by doubling."""
     power, done, whole = steps, 0, None
     while True:
         if n & 1:  # what is done so far covers `done` rotations from each place on

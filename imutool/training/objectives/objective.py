@@ -196,10 +196,7 @@ class Objective(ABC):
 
 
 class WindowEndObjective(Objective):
-    """What integration misses at the end of windows of several lengths.
-
-    `imutool.training.objectives.objective`.
-    """
+    """What integration misses at the end of windows of several lengths."""
 
     def _choose(self) -> None:
         lengths = dict.fromkeys(self.pool.samples(window_s) for window_s in self.settings.window_s[self.sensor])

@@ -40,10 +40,7 @@ Biases = Float[Tensor, "n 6"]
 
 
 class PaperLoss(Objective):
-    """Mean squares of what integration misses at each sample of a segment.
-
-    All segments count alike.
-    """
+    """Mean squares of what integration misses at each sample of a segment, all segments alike."""
 
     model: Network
 
@@ -154,10 +151,7 @@ def _sums(start: Float[Tensor, "b 3"], steps: Float[Tensor, "b n 3"]) -> Float[T
 
 
 class PaperTraining(Training):
-    """Training of the paper's scheme, in stages and with checkpoints as any other.
-
-    The fields compute in float32.
-    """
+    """Training of the paper's scheme, whose fields compute in float32."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)

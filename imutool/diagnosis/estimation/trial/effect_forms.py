@@ -61,10 +61,7 @@ def exponential(of_analog: Effect) -> Effect:
 
 
 def _of_low_pass(effect: Effect, *, exact: bool) -> list[Effect]:
-    """Forms of a low-pass without a rate; another effect itself.
-
-    A low-pass may be of each sensor alone. With `exact`, against a simulation, it may be of another order, too.
-    """
+    """Forms of a low-pass: of each sensor, and with `exact` (a simulation) of another order."""
     if effect.lagless is None:
         return [effect]
     both, first_order = analog(effect), ORDER in effect.parameters

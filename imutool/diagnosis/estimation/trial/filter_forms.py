@@ -228,10 +228,7 @@ def _starts(other: Effect, effect: Effect, theta: Theta | None, lag_s: float, ra
 
 
 def cutoff_hz(of: Effect, others: Sequence[float], lag_s: float) -> float:
-    """Cut-off frequency with which a low-pass has a lag.
-
-    It is that of the analog one if a filter at a rate has less.
-    """
+    """Cut-off with which a low-pass has a lag: the analog one's if a filter at a rate has less."""
 
     def longer_s(log_hz: float) -> float:
         return Design.of(of, np.array([np.exp(log_hz), *others])).lag_s - lag_s

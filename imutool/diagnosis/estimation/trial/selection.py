@@ -29,10 +29,7 @@ class SelectedEffect:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Selected effects, strongest first, with fits, trials, and what finds those like each.
-
-    `within_error` are names of effects that may be the error of a low-pass.
-    """
+    """Selected effects, strongest first, with fits, trials, and what finds those like each."""
 
     selected: tuple[SelectedEffect, ...]
     fitted: Fit
@@ -40,7 +37,7 @@ class Selection:
     tried: int
     always: int = 0
     similar: Callable[[], Mapping[str, tuple[str, ...]]] = dict
-    within_error: tuple[str, ...] = ()
+    within_error: tuple[str, ...] = ()  # names of effects that may be the error of a low-pass
 
     @property
     def remarks(self) -> tuple[str, ...]:
