@@ -45,7 +45,7 @@ class EstimateParts(NamedTuple):
 
 
 class BiasEstimator:
-    """Bias with its covariance, gyro (rad/s) then accel (m/s²), for samples that arrive in blocks."""
+    """Bias with its covariance, gyro (rad/s) then accel (m/s²), for samples in blocks."""
 
     def __init__(self, model: BiasModel, start: InitialBias) -> None:
         self._rest, self._calibration = start.estimator(model), model.calibration_covariance()

@@ -64,7 +64,7 @@ def corrected(model: BiasModel, start: InitialBias, imu: Imu) -> Imu:
 
 
 def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[DebiasedImu, Rows6]:
-    """Corrected samples as `apply`, and the bias' deviation at each: gyro (rad/s), then accel (m/s²)."""
+    """Corrected samples as `apply`, and the bias' deviation: gyro (rad/s), then accel (m/s²)."""
     estimator = BiasEstimator(model, start)
     good, (t_s, gyro, accel) = measured(imu.gyro, imu.accel), model_samples(model, imu)
     t_ns = imu.t_ns[good]

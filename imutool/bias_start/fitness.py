@@ -74,20 +74,17 @@ SURE, OWN = 3.0, 4.0  # standard deviations; of made-up sensors' own shares, the
 
 @dataclass(frozen=True)
 class _Evidence:
-    """Evidence of some samples about a prior: log-likelihood, share of surprising innovations, and the bias shown.
-
-    `difference` is that bias minus the prior's mean, `variance` its variance without the prior. `stops` begin and end (s).
-    """
+    """Evidence of some samples about a prior: log-likelihood, surprising innovations, bias shown."""
 
     log_likelihood: float
-    surprising: float
-    difference: Vector6
-    variance: Vector6
-    stops: tuple[tuple[float, float], ...] = ()
+    surprising: float  # share of the innovations
+    difference: Vector6  # of the bias shown from the prior's mean
+    variance: Vector6  # of it, without the prior
+    stops: tuple[tuple[float, float], ...] = ()  # begin and end (s)
 
 
 def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], about: Mapping[str, str]) -> Fitness:
-    """Fitness of a model for up to `CHECKED_S` of a log; `about` is its sensor and dataset, if known."""
+    """Fitness of a model for up to `CHECKED_S` of a log; `about` is its sensor and dataset."""
     samples = head(batches)
     if len(samples[0]) and (wrong := unusual_gravity(samples[2], start.rest[3:])):
         return Fitness("unfit", (wrong,))

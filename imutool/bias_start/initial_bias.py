@@ -175,7 +175,7 @@ def prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
 
 
 def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
-    """Prior of the bias filter from the training runs; the axes of a sensor share one random walk."""
+    """Prior of the bias filter from the training runs; a sensor's axes share one random walk."""
     start = prior(model, first_ns)
     ground = np.maximum(model.rest_std, AT_REST_STD)
     walk = np.repeat(np.sqrt(np.mean(model.walk_std.reshape(2, 3) ** 2, axis=1)), 3)
@@ -255,15 +255,12 @@ def model_samples(model: BiasModel, imu: Imu) -> Samples:
 
 
 class SmoothedBias(NamedTuple):
-    """Smoothed rest bias, time at rest, and what the log alone shows of the bias at its start.
-
-    `difference` is that bias minus the prior's mean, `variance` its variance: infinite where the log shows little.
-    """
+    """Smoothed rest bias, time at rest, and what the log alone shows of the bias at its start."""
 
     track: BiasTrajectory
     rested_s: float
-    difference: Vector6
-    variance: Vector6
+    difference: Vector6  # of that bias from the prior's mean
+    variance: Vector6  # of it: infinite where the log shows little
 
 
 def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> SmoothedBias:

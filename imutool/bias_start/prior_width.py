@@ -44,10 +44,9 @@ class LeastWidth(NamedTuple):
 class BiasPrior:
     """Prior of a run's biases.
 
-    Bias b in motion, offset at rest (mean zero), and random walk of b.
-
-    `walk` is in rad/s and m/s² per second^1/2, `settings` are those of its filter. With `minimum` the standard deviation of b
-    is only known to lie between that and `std`: the log decides (`supported_std`). Without `stops` rest is taken for motion.
+    Bias b in motion, offset at rest (mean zero), and random walk of b. `walk` is in rad/s and m/s² per second^1/2, `settings`
+    are those of its filter. With `minimum` the standard deviation of b is only known to lie between that and `std`: the log
+    decides (`supported_std`). Without `stops` rest is taken for motion.
     """
 
     mean: Vector6

@@ -136,9 +136,7 @@ def case_log(imu: Imu, truth: Poses, channels: Mapping[str, Scalars]) -> Recordi
 def write_case(folder: Path, sim: Recording, real: Recording, truth: ConcealedTruth) -> None:
     """Seals a case: writes all files next to the folder, then moves each into its place.
 
-    The envelope is moved last.
-
-    Logs are not compressed: how well numbers compress would tell which of them are rounded.
+    The envelope is moved last. Logs are not compressed: how well numbers compress would tell which of them are rounded.
 
     Raises:
         ConfigError: the system refuses to write; nothing is left behind.

@@ -44,7 +44,7 @@ CLIPPED_PERCENT = 5.0
 
 
 def clipping(theta: Theta, size: float, signal: Rows6) -> Theta:
-    """Limits that clip the largest axis 5 % of the time at the plausible size, and less at a smaller."""
+    """Limits that clip the largest axis 5 % of the time at the plausible size, else less."""
     share = 100.0 - CLIPPED_PERCENT * size
     at = np.array([np.percentile(np.abs(signal[:, part]).max(axis=1), share) for part in (GYRO, ACCEL)])
     return np.where(theta < NO_LIMIT, at, NO_LIMIT)
@@ -215,10 +215,7 @@ def _wander(rng: Generator, count: int, memory_s: float, dt: float) -> Times:
 
 
 def driven(rng: Generator, spread: Mapping[str, float]) -> tuple[Model, Theta]:
-    """Column that follows a channel: + gain c(t - lag).
-
-    Its plausible spread is 0.05 rad/s or 0.5 m/s².
-    """
+    """Column that follows a channel: + gain c(t - lag), as large as is plausible."""
     topic = DRIVERS[rng.integers(len(DRIVERS))]
     column = int(rng.integers(6))
     gain = (0.05 if column < 3 else 0.5) / spread[topic]

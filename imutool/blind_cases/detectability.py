@@ -1,9 +1,7 @@
-"""Detectability of a misfit.
+"""Detectability of a misfit against noise, given the bias and similar effects.
 
-Against noise, given the bias and similar effects (Fisher's information).
-
-For white Gaussian noise the information that samples hold on parameters is J^T J, J the signal's derivatives over the noise;
-nuisances (a constant bias, another effect) are projected out of J. A misfit m that the noise hides half of the time has
+For white Gaussian noise the information (Fisher) that samples hold on parameters is J^T J, J the signal's derivatives over the
+noise; nuisances (a constant bias, another effect) are projected out of J. A misfit m that the noise hides half of the time has
 |m|² = detectable_misfit(p): the noncentrality at which the chi-square test of p parameters, with one false alarm in a
 thousand, has a power of one half.
 """
@@ -138,9 +136,8 @@ def _orthonormal(columns: Float64[np.ndarray, "m p"]) -> Float64[np.ndarray, "m 
 def cramer_rao_bounds(scene: Scene, acting: Acting) -> list[Theta | None]:
     """Smallest standard deviations of unbiased estimates of the parameters (Cramér and Rao).
 
-    The bias counts as unknown.
-
-    All effects are estimated together. None for effects without a derivative; infinite where nothing can be seen.
+    The bias counts as unknown. All effects are estimated together. None for effects without a derivative; infinite where
+    nothing can be seen.
     """
     looked = Detectability(scene, scene.t_s[::DECIMATION], {})
     acting = list(acting)
@@ -199,7 +196,7 @@ def location(misfit: Rows6, sigma: Theta) -> Location:
 
 
 def achievable_rms(misfit: Rows6, sigma: Theta) -> dict[str, Rms]:
-    """RMS of real minus simulated samples by sensor without the bias: misfit and noise, noise alone."""
+    """RMS of real minus simulated samples by sensor, bias removed: with misfit, and of noise."""
     misfit = misfit - misfit.mean(axis=0)
     found = {}
     for name, part in (("gyro", GYRO), ("accel", ACCEL)):

@@ -1,9 +1,8 @@
 """Forward models of the effects that a blind case may conceal.
 
-They follow the catalogue's formulas.
-
-A model acts at its stage, in the order in which a signal passes them; `scene` has the order within one. Up to CONVERTER a
-signal is an array of six columns: gyro (rad/s), then accel (m/s²). The estimator has forward models of its own and uses none.
+They follow the catalogue's formulas. A model acts at its stage, in the order in which a signal passes them; `scene` has the
+order within one. Up to CONVERTER a signal is an array of six columns: gyro (rad/s), then accel (m/s²). The estimator has
+forward models of its own and uses none.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class Stage(IntEnum):
 
 @dataclass(frozen=True)
 class Parameter:
-    """Parameter of a model; an `amount` grows with the size of the effect, a time or frequency does not."""
+    """Parameter of a model; an `amount` (no time or frequency) grows with the effect's size."""
 
     name: str
     unit: str
@@ -55,7 +54,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Reading:
-    """Input of a SENSOR model: seconds since the log's start, the signal, and the log's other channels."""
+    """Input of a SENSOR model: seconds from the log's start, the signal, and other channels."""
 
     t_s: Times
     signal: Rows6
@@ -199,7 +198,7 @@ def first_order(signal: Columns, rate_hz: float, cut_off_hz: float) -> Columns:
 
 
 def spring_mount(signal: Columns, rate_hz: float, f0_hz: float, zeta: float) -> Columns:
-    """Acceleration on a spring and damper: H = (2 zeta w s + w²) / (s² + 2 zeta w s + w²) of the base's."""
+    """Acceleration on a spring: H = (2 zeta w s + w²) / (s² + 2 zeta w s + w²) of the base's."""
     w = 2.0 * np.pi * f0_hz
     return _filtered(signal, rate_hz, [2.0 * zeta * w, w * w], [1.0, 2.0 * zeta * w, w * w])
 

@@ -50,7 +50,7 @@ class Rms(Section, frozen=True):
 
 
 class TrueParameter(Section, frozen=True):
-    """True value of a parameter, its scale, and the smallest possible deviation of an estimate, if any."""
+    """True value of a parameter, its scale, and the least deviation of an estimate, if any."""
 
     value: float
     unit: str

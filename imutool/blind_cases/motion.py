@@ -31,7 +31,7 @@ Knots = Float64[np.ndarray, " m"]
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """Rate omega (rad/s), derivative alpha and specific force f = R_wb^T (a_w - g_w), in the body frame."""
+    """Rate omega (rad/s), derivative alpha, specific force f = R_wb^T (a_w - g_w), body frame."""
 
     t_s: Times
     omega: Vectors

@@ -1,6 +1,4 @@
-"""Random choice of what a blind case conceals.
-
-Sized so that an optimal estimator could see it.
+"""Random choice of what a blind case conceals, so large that an optimal estimator sees it.
 
 Sizes: `large` is the plausible size of the catalogue, `middle` a quarter of it, `small` 3.5 times the smallest that an optimal
 test sees (`information.detectable_misfit`), against the noise and against the most similar other effect. An effect that the
@@ -135,7 +133,7 @@ def _candidates(seen: Detectability, rng: Generator, kind: str, effects: Sequenc
 
 
 def sized(seen: Detectability, model: Model, theta: Theta, size: Size) -> tuple[Theta, float] | None:
-    """Parameters at a size, and its ratio to the plausible one; None where the motion does not show it."""
+    """Parameters at a size, and its ratio to the plausible one; None if no motion shows it."""
     ideal = seen.scene.ideal(seen.t_s)
     fixed = size == "small" and model.name in FIXED_SMALL
     factor = FIXED_SMALL[model.name] if fixed else FACTOR.get(size, 1.0)

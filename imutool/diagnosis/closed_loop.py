@@ -46,7 +46,7 @@ def closed_loop(
     metric: tuple[float, float] | None = None,
     rounds: int = 1,
 ) -> ClosedLoop:
-    """Figures of a recording and two simulations, the second with found physics; the user's `metric`."""
+    """Figures of a recording and two simulations, the second with the physics that was found."""
     other = ANOTHER_MOTION in second.remarks and ANOTHER_MOTION not in first.remarks  # then its figures are of other poses
     compared = [] if other else [*_compared(_shared(first, second))]
     if metric is not None:

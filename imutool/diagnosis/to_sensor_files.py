@@ -56,7 +56,7 @@ def _started(effect: Effect, parameters: Mapping[str, Estimate]) -> tuple[Effect
 
 
 def to_physics_file(d: Diagnosis) -> PhysicsFile:
-    """Physics file with the findings and, if known, the first log's bias, to which curves add a mean."""
+    """Physics file with the findings and, if known, the first log's bias (plus curves' means)."""
     entries, curves, terms = [], [], []
     bias = np.array(d.bias[0], dtype=np.float64)
     for finding in d.findings:

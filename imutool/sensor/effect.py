@@ -211,7 +211,7 @@ class Remembered:
 
 
 def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Vectors, Vectors]:
-    """Samples minus the ideal ones at the same stamps, to start a fit from: gyro (rad/s), accel (m/s²)."""
+    """Samples minus ideal ones at the same stamps, to start a fit from: rad/s, m/s²."""
     ideal = motion.sample(samples.stamp_s, samples.stamp_s)
     return samples.gyro - ideal.gyro, samples.accel - ideal.accel
 

@@ -161,19 +161,14 @@ def _coefficients(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:
 
 @dataclass(frozen=True, eq=False)
 class IdealMotion:
-    """Ideal signals of the tracked point of a body, on an even clock of seconds.
-
-    gyro: angular rate, body frame (rad/s); accel: specific force R_wb^T (a_w - g_w) (m/s²); alpha: angular acceleration
-    (rad/s²); R_wb: attitude, where it is known. `channels` are other numbers of the log on the same clock (temperature in °C, a
-    motor current), by `topic.field`.
-    """
+    """Ideal signals of the tracked point of a body, on an even clock of seconds."""
 
     t_s: Times
-    gyro: Vectors
-    accel: Vectors
-    alpha: Vectors
-    R_wb: Float64[np.ndarray, "n 3 3"] | None = None
-    channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING)
+    gyro: Vectors  # angular rate, body frame (rad/s)
+    accel: Vectors  # specific force R_wb^T (a_w - g_w) (m/s²)
+    alpha: Vectors  # angular acceleration (rad/s²)
+    R_wb: Float64[np.ndarray, "n 3 3"] | None = None  # attitude, where it is known
+    channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING)  # by `TOPIC.field`
     sampler: Sampler = field(default_factory=Sampler, repr=False)
 
     @property

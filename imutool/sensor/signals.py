@@ -50,14 +50,11 @@ Load = Float64[np.ndarray, "3 11"]  # state of a slow drift, by time constant an
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """Signals, one row a sample: rad/s, m/s², derivatives, vibration power in (m/s²)².
-
-    `temperature` has the terms of the log's temperature in a training (`imutool.bias.temperature`).
-    """
+    """Signals, one row a sample: rad/s, m/s², derivatives, vibration power in (m/s²)²."""
 
     t_s: Float64[np.ndarray, " n"]
     columns: Float64[np.ndarray, "n 60"]
-    temperature: Float64[np.ndarray, "n 12"] | None = None
+    temperature: Float64[np.ndarray, "n 12"] | None = None  # its terms, in a training (`imutool.bias.temperature`)
 
     @property
     def gyro(self) -> Vectors:
@@ -238,7 +235,7 @@ def low_pass(x: Float64[np.ndarray, "n k"], gain: float, before: Float64[np.ndar
 
 
 def vibration_power(rate_hz: float, accel: Vectors) -> Vectors:
-    """The signals' `vibration` of a whole log at once, six times faster."""
+    """The signals' `vibration` of a whole log at once, six times faster than all signals."""
     from scipy.signal import lfilter
 
     slow, power = -np.expm1(-1.0 / (rate_hz * np.array([SLOW_S, POWER_S])))

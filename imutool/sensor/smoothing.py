@@ -40,18 +40,13 @@ Band = Float64[np.ndarray, "6 c"]
 
 @dataclass(frozen=True, eq=False)
 class Penalised:
-    """Penalised spline fitted to noisy samples.
-
-    `noise` is a sample's standard deviation at weight 1; a motion at `cutoff_hz` comes out at half its size.
-
-    `penalty` is what it was fitted with, `likeliest` the one that the samples ask for.
-    """
+    """Penalised spline fitted to noisy samples."""
 
     spline: BSpline
-    noise: float
-    cutoff_hz: float
-    penalty: float
-    likeliest: float
+    noise: float  # a sample's standard deviation at weight 1
+    cutoff_hz: float  # a motion at it comes out at half its size
+    penalty: float  # it was fitted with
+    likeliest: float  # penalty that the samples ask for
     samples: Samples
 
     def residual(self) -> Values:
@@ -80,9 +75,8 @@ class Penalised:
     def end_s(self, derivative: int, worse: float, minimum: float) -> float:
         """Time (s) from an end within which a derivative is uncertain.
 
-        There its deviation is above `minimum` and `worse` times the inner one.
-
-        From the posterior of an even piece as dense as the data, in full; at most half of that piece.
+        There its deviation is above `minimum` and `worse` times the inner one. From the posterior of an even piece as dense as
+        the data, in full; at most half of that piece.
         """
         own = self.samples
         count = min(own.count, END_COEFFICIENTS)

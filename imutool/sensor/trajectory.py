@@ -58,20 +58,16 @@ Values = Float64[np.ndarray, "n d"]
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Stretch of motion without a hole, trusted from `start_s` to `end_s` after the first pose.
-
-    noise_m, noise_rad: standard deviation of a pose by coordinate. cutoff_hz: where smoothing halves a motion, of position and
-    rotation. gyro_std (rad/s), accel_std (m/s²): of the ideal signals, by axis, as far as noise and smoothing explain it.
-    """
+    """Stretch of motion without a hole, trusted from `start_s` to `end_s` after the first pose."""
 
     trajectory: Trajectory
     start_s: float
     end_s: float
-    noise_m: float
-    noise_rad: float
-    cutoff_hz: tuple[float, float]
-    gyro_std: float
-    accel_std: float
+    noise_m: float  # of a pose, by coordinate
+    noise_rad: float  # the same
+    cutoff_hz: tuple[float, float]  # where smoothing halves a motion, of position and rotation
+    gyro_std: float  # of the ideal signal (rad/s), by axis, as noise and smoothing explain it
+    accel_std: float  # the same (m/s²)
 
     @property
     def duration_s(self) -> float:

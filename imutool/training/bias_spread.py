@@ -47,14 +47,11 @@ BY_CHANCE = 0.01  # probability that logs seem to show a shift of the bias at re
 
 
 class TurnOn(NamedTuple):
-    """Rest bias of the next session, and the sessions known.
-
-    Its standard deviation is `std` for a sensor of the usual kind, and may be as little as `min_std`.
-    """
+    """Rest bias of the next session, and the sessions known."""
 
     mean: Vector6
-    std: Vector6
-    min_std: Vector6
+    std: Vector6  # for a sensor of the usual kind
+    min_std: Vector6  # as little as it may be
     sessions: list[Session]
 
     def card(self) -> dict[str, Any]:

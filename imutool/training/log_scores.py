@@ -29,17 +29,14 @@ DRIFT_S = 5.0
 
 @dataclass(frozen=True)
 class Score:
-    """Errors of a left-out log with one model and start.
-
-    AOE (°), and after 5 s from the truth those of the velocity (m/s) and the attitude (°).
-    """
+    """Errors of a left-out log with one model and start."""
 
     log: str
     model: str
     start: str
     aoe_deg: float
-    drift_m_s: float | None
-    drift_deg: float | None = None
+    drift_m_s: float | None  # of the velocity, 5 s from the truth
+    drift_deg: float | None = None  # of the attitude, 5 s from the truth
 
 
 def scores_of(log: Recording, name: str, model: BiasModel | None, alone: Bool[np.ndarray, " n"]) -> list[Score]:

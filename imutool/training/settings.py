@@ -100,9 +100,8 @@ class SensorPrior(Settings, frozen=True):
 class TrainSettings(Settings, frozen=True):
     """How to train; `model` holds the settings of the method.
 
-    `imutool/bias/METHOD.py`, class Config.
-
-    The defaults here are those of linear and neural_ode; `settings_of` has those of any method.
+    `imutool/bias/METHOD.py`, class Config. The defaults here are those of linear and neural_ode; `settings_of` has those of any
+    method.
     """
 
     seed: Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)] = 0  # of the random numbers: first weights, batches

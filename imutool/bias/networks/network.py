@@ -35,16 +35,12 @@ class Segment:
 
 
 class LastLayer(NamedTuple):
-    """Weights in which a sensor's motion bias is linear, W u + out x.
-
-    u are the samples, x the inputs of the layer in the unit of the bias. `prior_root` is the root of the covariance that a row
-    of `out` has a priori, but for a factor.
-    """
+    """Weights in which a sensor's motion bias is linear, W u + out x, with u the samples."""
 
     W: Float[Tensor, "3 3"]
     out: Float[Tensor, "3 k"]
-    inputs: Callable[[Segment], Float[Tensor, "batch n k"]]
-    prior_root: Float[Tensor, "k k"]
+    inputs: Callable[[Segment], Float[Tensor, "batch n k"]]  # x, in the unit of the bias
+    prior_root: Float[Tensor, "k k"]  # of the covariance of a row of `out` a priori, but for a factor
 
 
 class BiasNetwork(nn.Module, ABC):

@@ -109,11 +109,9 @@ def euler_steps(
 ) -> Float[Tensor, "k b 3"]:
     """States from `rest` on of b' = b + step out(x), x from residual blocks.
 
-    The blocks begin with the state `(b - centre) / unit` and the motion.
-
-    `blocks` are perceptrons of residual blocks. A step is so small that the gradient of each of its operations costs more than
-    the arithmetic: here the derivative runs back through the states alone, and that by the weights is one product a layer.
-    Gradients reach the weights and `rest`.
+    The blocks begin with the state `(b - centre) / unit` and the motion. `blocks` are perceptrons of residual blocks. A step is
+    so small that the gradient of each of its operations costs more than the arithmetic: here the derivative runs back through
+    the states alone, and that by the weights is one product a layer. Gradients reach the weights and `rest`.
     """
     linear = [layer for block in blocks for layer in block if isinstance(layer, nn.Linear)]
     weights = [tensor for layer in (*linear, out) for tensor in (layer.weight, layer.bias)]

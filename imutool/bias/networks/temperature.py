@@ -82,7 +82,7 @@ def online_signals(
     scale: Scale | None,
     loads: Sequence[Load | None],
 ) -> Signals:
-    """Signals of `counts` samples of each log from its first true pose on; its load is before the log."""
+    """Signals of so many samples of each log from its first true pose on; filters start earlier."""
     parts: list[Signals] = []
     for recording, count, load in zip(recordings, counts, loads, strict=True):
         first = int(np.searchsorted(recording.imu.t_ns, recording.overlap().imu.t_ns[0]))

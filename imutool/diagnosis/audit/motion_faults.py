@@ -1,4 +1,4 @@
-"""Faults of a simulated IMU's motion and its timing, and what of its motion nothing explains."""
+"""Faults of a simulated IMU's motion and timing, and what of its motion nothing explains."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def motion_faults(k: Kinematics, fit: KinematicFit, filters: tuple[float, float]
 
 
 def unexplained(k: Kinematics, fit: KinematicFit, faults: Sequence[FaultFound]) -> dict[str, float]:
-    """Large shares (of the rms) of sensors' motions that neither poses nor a fault nor noise explain."""
+    """Large shares (of rms) of a sensor's motion that no pose, fault or noise explains."""
     scaled = {fault.fault for fault in faults} & {"other_clock", "gravity_only"}
     out: dict[str, float] = {}
     for sensor, samples, name in (("gyro", k.gyro, "scale"), ("accel", k.accel, "m")):

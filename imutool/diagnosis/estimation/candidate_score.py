@@ -245,14 +245,11 @@ class Candidates:
 
 
 class Portable(NamedTuple):
-    """Description of a fit for another process.
-
-    `restored` makes the fit again from it. `unnamed` is how many effects without a name the search had tried.
-    """
+    """Description of a fit for another process, from which `restored` makes it again."""
 
     chosen: list[tuple[str, list[str], Theta]]
     numbers: dict[str, Any]
-    unnamed: int
+    unnamed: int  # effects without a name that the search had tried
 
 
 def portable(search: Any, found: Fit) -> Portable:

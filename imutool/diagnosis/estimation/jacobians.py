@@ -231,7 +231,7 @@ def priors(begun: Chosen, settings: FitSettings) -> tuple[Float64[np.ndarray, " 
 
 
 class EffectJacobian(NamedTuple):
-    """Nonzero white rows of the Jacobian of one effect on one log, each with its axis and parameter."""
+    """Nonzero white rows of an effect's Jacobian on one log, each with its axis and parameter."""
 
     rows: Float64[np.ndarray, "r n"]
     axes: Int64[np.ndarray, " r"]

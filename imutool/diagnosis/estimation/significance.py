@@ -113,17 +113,11 @@ def _gain_without(whole: Fit, left_out: Sequence[int], iterations: int | None) -
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Robust standard deviations by effect, with their inflation and degrees of freedom.
-
-    They are no less than by information.
-
-    `inflation` is the ratio of the blocks' variance to the information's by effect, at least 1; `blocks` the number of
-    independent blocks less one that it rests on.
-    """
+    """Robust standard deviations by effect, no less than by information."""
 
     std: dict[str, Float64[np.ndarray, " _"]]
-    inflation: dict[str, float]
-    blocks: dict[str, float]
+    inflation: dict[str, float]  # ratio of the blocks' variance to the information's, at least 1
+    blocks: dict[str, float]  # independent ones less one, on which that rests
 
     def log_p_value(self, key: str, gain: float, parameters: int) -> float:
         """Logarithm of the p-value of a gain in squares, by F."""

@@ -130,7 +130,7 @@ def _curve(variable: str, sensor: int, axis: int, splines: SplineBasis) -> Effec
 
 
 class Curve(AddedColumns, SplineCurve):
-    """+ a spline of one variable on one axis of an IMU; curves of one variable share their splines."""
+    """+ a spline of one variable on one axis of an IMU; curves of a variable share splines."""
 
     def __init__(self, variable: str, sensor: int, axis: int, splines: SplineBasis) -> None:
         super().__init__(variable, unit(variable), splines.inner, columns=len(AXES), axis=axis)

@@ -76,17 +76,13 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Whitener:
-    """Whitening filter for each axis, with the standard deviation of its output.
-
-    `counts` are the values that come out and tell anything (none: all); the others come out as zero, whatever goes in. `walk`
-    are the variances of the steps of a bias that walks, from row to row and in units of `std` (none: the bias is constant).
-    """
+    """Whitening filter for each axis, with the standard deviation of its output."""
 
     filters: Float64[np.ndarray, "k order"]
     std: Float64[np.ndarray, " k"]
     band: Band | None = None
-    counts: Bool[np.ndarray, "m k"] | None = None
-    walk: Float64[np.ndarray, " k"] | None = None
+    counts: Bool[np.ndarray, "m k"] | None = None  # values that tell anything (None: all); the others come out as zero
+    walk: Float64[np.ndarray, " k"] | None = None  # variances of a walking bias' steps, by row, in `std` (None: constant)
 
     def __call__(self, x: Float64[np.ndarray, "n k *p"]) -> Float64[np.ndarray, "m k *p"]:
         """White rows from coloured ones (fewer in a band); columns of zeros stay zeros."""

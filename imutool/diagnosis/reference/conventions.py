@@ -28,7 +28,7 @@ CONSTANT = 0.1  # of the squares of the specific force: a bias and a tilt leave 
 
 
 def with_common_conventions(pairs: Sequence[Pair], of: str = "simulation") -> tuple[list[Pair], list[Finding]]:
-    """Recordings in the units and axes of their reference (`of`), and findings of those that differ."""
+    """Recordings in the units and axes of a reference, `of` by name; findings of what differs."""
     shown: dict[Sensor, _Convention] = {}
     for sensor in SENSORS:
         part = COLUMNS[sensor]
@@ -55,15 +55,12 @@ def _with_z_up(pair: Pair) -> Pair:
 
 
 class _Convention(NamedTuple):
-    """Factor and axes P with factor y P = x as far as the motion shows them, and the share of the squares that they leave.
-
-    `needed`: the reference's axes leave too much for a turned mount, as an axis that hardly turns never does.
-    """
+    """Factor and axes P with factor y P = x as far as the motion shows them, and what they leave."""
 
     factor: float
     P: Matrix
-    misfit: float
-    needed: bool
+    misfit: float  # share of the squares
+    needed: bool  # the reference's axes leave too much for a turned mount
 
     def beside(self, other: _Convention) -> tuple[float, Matrix]:
         """Factor and axes, if they explain the motion; less of it where the other sensor shows the same axes."""

@@ -38,21 +38,17 @@ STATE_WORDS = {"dq": "speed of joint {}", "ddq": "acceleration of joint {}", "sp
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AlignedSignal(AlignedLog):
-    """Recorded columns with the ideal signal.
-
-    `lag_s` is how much later the recording follows at first sight, `sim_density` the density of the simulation's own noise, by
-    column. `constants` are the factors by which recorded currents were made torques.
-    """
+    """Recorded columns with the ideal signal."""
 
     ideal: IdealSignal
     names: tuple[str, ...]
     units: tuple[str, ...]
     kind: str
-    sim_density: Float64[np.ndarray, " k"]
-    lag_s: float = 0.0
+    sim_density: Float64[np.ndarray, " k"]  # of the simulation's own noise, by column
+    lag_s: float = 0.0  # by which the recording follows at first sight
     shares_epoch: bool = True
     clock_std_s: float = 0.0
-    constants: tuple[float, ...] = ()
+    constants: tuple[float, ...] = ()  # factors by which recorded currents were made torques
 
     exact = True
 

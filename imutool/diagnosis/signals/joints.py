@@ -67,7 +67,7 @@ def joint_remarks(topic: str, real: Sequence[str], sim: Sequence[str]) -> list[s
 def joint_pairs(
     topic: str, real: Mapping[str, Fields], sim: Mapping[str, Fields], wheels: Collection[str]
 ) -> Iterator[SignalPair]:
-    """Efforts with the motion of the joints (but `wheels`) where both logs have both, else each number."""
+    """Efforts with the motion of joints but wheels where both logs have both, else each number."""
     both = [path for path in sim if path in real and not path.endswith(tuple(wheels))]  # in the order of the model
     joints = [path.removeprefix("position") for path in both if path.startswith("position")]
     driven = [k for k in joints if f"effort{k}" in both]
@@ -131,10 +131,7 @@ def wheel_pair(
     sim: Mapping[str, Fields],
     joints: tuple[Mapping[str, Fields], Mapping[str, Fields]],
 ) -> tuple[SignalPair, list[str]] | None:
-    """Speeds of a vehicle with those of the joints that drive it, and their indices.
-
-    None where a log lacks one or the other, or where fewer than two joints drive.
-    """
+    """A vehicle's speeds with those of two or more joints that drive it, and their indices."""
     if not all(path in side for path in SPEEDS for side in (real, sim)):
         return None
     speeds = [_speeds(side) for side in joints]

@@ -35,15 +35,12 @@ ELSEWHERE = frozenset(
 
 @dataclass(frozen=True)
 class LogFields:
-    """One log: schemas by topic, varying fields by topic and path, and names of joints.
-
-    `mixed` are topics of joints on which messages name now these joints, now those: an index there is no one joint.
-    """
+    """One log: schemas by topic, varying fields by topic and path, and names of joints."""
 
     schemas: Mapping[str, str]
     fields: Mapping[str, Mapping[str, Fields]]
     joints: Mapping[str, list[str]]
-    mixed: Sequence[str]
+    mixed: Sequence[str]  # topics on which messages name now these joints, now those: an index is no one joint
 
     @classmethod
     def of(cls, path: Location, schemas: Mapping[str, str], compared: Collection[str]) -> LogFields:

@@ -15,7 +15,7 @@ EARTH_RAD_S = 7.292115e-5  # WGS 84
 
 
 def omega_w(latitude: float, heading: float) -> Float64[np.ndarray, "3"]:
-    """Earth rate in the world frame, z up (rad/s); `heading` is north's angle from x about z (rad)."""
+    """Earth rate (rad/s) in the world, z up; `heading` is north's angle from x about z (rad)."""
     level = math.cos(latitude)
     return EARTH_RAD_S * np.array([level * math.cos(heading), level * math.sin(heading), math.sin(latitude)])
 

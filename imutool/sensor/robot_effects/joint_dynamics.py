@@ -34,18 +34,14 @@ STEEP = 0.01  # of a velocity's size, within which its sign turns
 
 @dataclass(frozen=True)
 class Dynamics:
-    """Efforts of an arm as a function of its motion (`q0`, `dq0`, `ddq0`, ...).
-
-    `signs` are those of the angles of a chain of parallel hinges, empty for any other arm; `spatial` has the axes of another
-    chain of hinges. `residual_std` is that of the fit, by joint. `order` are the joints from base to tip; a log may differ.
-    """
+    """Efforts of an arm as a function of its motion (`q0`, `dq0`, `ddq0`, ...)."""
 
     joints: int
-    signs: tuple[int, ...]
+    signs: tuple[int, ...]  # of the angles of a chain of parallel hinges, empty for any other arm
     coefficients: Float64[np.ndarray, "_ _"]
-    residual_std: tuple[float, ...]
-    order: tuple[int, ...]
-    spatial: SpatialChain | None = None
+    residual_std: tuple[float, ...]  # of the fit, by joint
+    order: tuple[int, ...]  # joints from base to tip; a log may differ
+    spatial: SpatialChain | None = None  # axes of another chain of hinges
 
     def __call__(self, state: State) -> Columns:
         """Efforts of all joints."""

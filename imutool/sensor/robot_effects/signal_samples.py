@@ -22,18 +22,14 @@ NO_STATE: State = {}
 
 @dataclass(frozen=True, eq=False)
 class SignalSamples:
-    """Signal samples between effects, with the ideal signal and its derivative.
-
-    `y` is the value now; `x` and `dx` (per second) are the ideal ones as sampled, `state` what the signal depends on at the
-    time it was sampled (`q0`, `dq0`), and `channels` other numbers of the log with their times.
-    """
+    """Signal samples between effects, with the ideal signal and its derivative."""
 
     stamp_s: Samples
-    y: Values
-    x: Values
-    dx: Values
-    state: State
-    channels: Mapping[str, tuple[Column, Column]]
+    y: Values  # now
+    x: Values  # ideal, as sampled
+    dx: Values  # the same, per second
+    state: State  # on which the signal depends when it is sampled (`q0`, `dq0`)
+    channels: Mapping[str, tuple[Column, Column]]  # other numbers of the log, with their times
 
     def but(self, y: Values) -> SignalSamples:
         """The samples with other values."""
@@ -56,18 +52,14 @@ class SignalSamples:
 
 @dataclass(frozen=True, eq=False)
 class IdealSignal:
-    """Ideal signal on a fine even clock, its state, and other channels by name.
-
-    Channels have times of their own (s). `relation` computes the signal from the state where the simulation showed how (none:
-    the signal is the simulation's own).
-    """
+    """Ideal signal on a fine even clock, its state, and other channels by name."""
 
     start_s: float
     rate_hz: float
     fine: Columns
-    channels: Mapping[str, tuple[Column, Column]]
+    channels: Mapping[str, tuple[Column, Column]]  # with times of their own (s)
     state: State = field(default_factory=lambda: NO_STATE)
-    relation: Callable[[State], Any] | None = None
+    relation: Callable[[State], Any] | None = None  # of the signal to the state, if the simulation showed one
 
     @cached_property
     def _coefficients(self) -> list[tuple[Column, Column]]:

@@ -14,21 +14,16 @@ from imutool.sensor.robot_effects.joint_dynamics import Dynamics
 
 @dataclass(frozen=True)
 class Scale:
-    """Names, units and sizes of a signal's columns.
+    """Names, units and sizes of a signal's columns."""
 
-    `names` are TOPIC.field; `size` and `slope` (per second) are standard deviations, `lag_s` the lag at first sight,
-    `duration_s` the length of the log. `state` has the standard deviation of each state, `dynamics` is the relation of an
-    arm's efforts to its motion, where the simulation showed one.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # TOPIC.field
     units: tuple[str, ...]
-    size: tuple[float, ...]
-    slope: tuple[float, ...]
-    lag_s: float
-    duration_s: float
-    state: Mapping[str, float]
-    dynamics: Dynamics | None = None
+    size: tuple[float, ...]  # standard deviation
+    slope: tuple[float, ...]  # standard deviation, per second
+    lag_s: float  # at first sight
+    duration_s: float  # of the log
+    state: Mapping[str, float]  # standard deviation of each
+    dynamics: Dynamics | None = None  # relation of an arm's efforts to its motion, if the simulation showed one
 
     @property
     def columns(self) -> range:

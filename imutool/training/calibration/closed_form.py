@@ -42,15 +42,12 @@ END_SAMPLES = 3  # whose mean is the rate at an end of a window
 
 @dataclass(frozen=True)
 class Solution:
-    """W, and the rest bias of each log (rad/s or m/s²) with its standard deviation.
-
-    `covariance` is that of W, row by row, as wide as the logs scatter; it is empty without a matrix.
-    """
+    """W, and the rest bias of each log (rad/s or m/s²) with its standard deviation."""
 
     W: Float[Tensor, "3 3"]
-    covariance: Float[Tensor, "p p"]
+    covariance: Float[Tensor, "p p"]  # of W, row by row, as wide as the logs scatter; empty without a matrix
     rest: Float[Tensor, "logs 3"]
-    std: Float[Tensor, "logs 3"]
+    std: Float[Tensor, "logs 3"]  # of `rest`
 
 
 def carried_attitudes(model: BiasNetwork, windows: Windows) -> Float[Tensor, "batch n 3 3"]:

@@ -49,16 +49,13 @@ UNSEEN = 0.9  # of its prior's width: a parameter no narrower was not seen
 
 @dataclass(frozen=True)
 class Calibration:
-    """Chosen effects, their parameters in order, and the covariance of these.
-
-    gains: share of the loss that each effect took off logs that had no part in its fit, in the order of choice.
-    """
+    """Chosen effects, their parameters in order, and the covariance of these."""
 
     effects: tuple[str, ...]
     theta: Float[Tensor, " p"]
     covariance: Float[Tensor, "p p"]
     own: Float[Tensor, "logs o"]
-    gains: Mapping[str, float]
+    gains: Mapping[str, float]  # share of the loss that each took off logs without a part in its fit, in the order of choice
     unseen: tuple[str, ...]
     forms: tuple[LinearForm, ...]  # candidates
     problem: Problem  # of all candidates, on the part that they were chosen on

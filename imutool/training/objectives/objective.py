@@ -118,9 +118,7 @@ def orientation_error(model: BiasNetwork, windows: Windows) -> Float[Tensor, " b
 def motion_error(model: BiasNetwork, windows: Windows) -> Float[Tensor, " batch"]:
     """|v_hat - v| and |p_hat - p| / window together, at the end of each window, in m/s.
 
-    Paper, eq. 17, in one unit.
-
-    The attitude follows the debiased gyro, whose weights this stage leaves alone.
+    Paper, eq. 17, in one unit. The attitude follows the debiased gyro, whose weights this stage leaves alone.
     """
     segment, dt = windows.segment, windows.dt[..., None]
     with torch.no_grad():
@@ -143,9 +141,8 @@ def error(model: BiasNetwork, sensor: Sensor, windows: Windows) -> Float[Tensor,
 class RobustLoss:
     """Huber's loss, its width 1.5 medians of the errors at the stage's start.
 
-    Each length of windows of each log has its own median.
-
-    Fixed during a stage, so that the loss can be followed; by log, because truths differ in quality by a factor of eight.
+    Each length of windows of each log has its own median. Fixed during a stage, so that the loss can be followed; by log,
+    because truths differ in quality by a factor of eight.
     """
 
     def __init__(self, medians: Mapping[int, Float[Tensor, " logs"]]) -> None:

@@ -41,7 +41,7 @@ def order_squares(found: Fit, effect: Effect) -> float:
 
 
 def order_std(found: Fit) -> dict[str, Theta]:
-    """Deviations of the parameters by the order of the effects: reversed, or each on the true reading."""
+    """Deviations of parameters by effects' order: reversed, or each on the true reading."""
     pairs = _pairs(found)
     if not pairs or sum(_is_of(READINGS, effect) for effect, _ in found.chosen) < 2:
         return {}

@@ -12,19 +12,15 @@ from imutool.sensor.effect import Effect, Theta
 
 @dataclass(frozen=True, eq=False)
 class SelectedEffect:
-    """Selected effect with its parameters and the cost of leaving it out.
-
-    `p_value` is by chi-square over all rows, `gain` the squares that leaving it out adds there, `unidentified` its parameters
-    that no motion showed.
-    """
+    """Selected effect with its parameters and the cost of leaving it out."""
 
     effect: Effect
     theta: Theta
     std: Theta
-    unidentified: tuple[str, ...]
-    p_value: float
+    unidentified: tuple[str, ...]  # parameters that no motion showed
+    p_value: float  # by chi-square over all rows
     false_discovery_rate: float
-    gain: float
+    gain: float  # squares that leaving it out adds on all rows
 
 
 @dataclass(frozen=True, eq=False)
