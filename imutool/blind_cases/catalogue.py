@@ -215,10 +215,7 @@ def _wander(rng: Generator, count: int, memory_s: float, dt: float) -> Times:
 
 
 def driven(rng: Generator, spread: Mapping[str, float]) -> tuple[Model, Theta]:
-    """Column that follows a channel: + gain c(t - lag).
-
-    Its plausible spread is 0.05 rad/s or 0.5 m/s².
-    """
+    """Column that follows a channel: + gain c(t - lag), as large as is plausible."""
     topic = DRIVERS[rng.integers(len(DRIVERS))]
     column = int(rng.integers(6))
     gain = (0.05 if column < 3 else 0.5) / spread[topic]

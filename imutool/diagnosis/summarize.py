@@ -54,7 +54,7 @@ def summarize(
     sim_findings: Sequence[Finding],
     hidden: Sequence[str],
 ) -> Diagnosis:
-    """Diagnosis from selected effects, paths by the name of a log, and unobservable parameters."""
+    """Diagnosis from selected effects; findings shared with a simulation are left out."""
     pairs, noise = [log.pair for log in logs], noise_floor(logs)
     exact = all(pair.exact for pair in pairs)
     sample = noise if exact else np.asarray(np.median([white_noise(pair.real) for pair in pairs], axis=0))

@@ -131,10 +131,7 @@ def wheel_pair(
     sim: Mapping[str, Fields],
     joints: tuple[Mapping[str, Fields], Mapping[str, Fields]],
 ) -> tuple[SignalPair, list[str]] | None:
-    """Speeds of a vehicle with those of the joints that drive it, and their indices.
-
-    None where a log lacks one or the other, or where fewer than two joints drive.
-    """
+    """A vehicle's speeds with those of two or more joints that drive it, and their indices."""
     if not all(path in side for path in SPEEDS for side in (real, sim)):
         return None
     speeds = [_speeds(side) for side in joints]

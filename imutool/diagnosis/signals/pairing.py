@@ -212,10 +212,7 @@ def _speed(side: LogFields) -> dict[str, Fields]:
 
 
 def _drivers(side: LogFields, pairs: Sequence[SignalPair], parts: Set[str]) -> dict[str, Fields]:
-    """Numbers of the recording that may drive a misfit: temperatures, no motion, what is compared itself last.
-
-    Topics that are `parts` of a field are none.
-    """
+    """Numbers of the recording (but `parts` of a field) that may drive a misfit: temperatures; what is compared last."""
     compared = {name: pair.kind for pair in pairs for name in pair.names}
     found = {
         f"{topic}.{path}": values

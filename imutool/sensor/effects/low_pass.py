@@ -47,10 +47,7 @@ WAVES = np.exp(-1j * OMEGA[:, None] * np.arange(-AHEAD, BEHIND + 1))
 
 
 def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
-    """f_c (Hz), the rate of a digital filter, the order, and the rate of exponential smoothing.
-
-    The filter starts settled; an infinite cut-off frequency lets everything pass.
-    """
+    """f_c (Hz), the rate of a digital filter, the order, and the rate of exponential smoothing; it starts settled."""
     if math.isinf(theta[0]):
         return motion
     design = _design(theta)

@@ -23,10 +23,7 @@ START_HZ = (5.0, 12.0, 30.0, 80.0)
 
 
 def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
-    """f_c (Hz), zeta, the rate of a digital filter, and that of exponential smoothing twice.
-
-    The filter starts settled, and an infinite cut-off frequency lets everything pass.
-    """
+    """f_c (Hz), zeta, the rate of a digital filter, and that of exponential smoothing twice; it starts settled."""
     if math.isinf(theta[0]):
         return motion
     if np.isfinite(theta[2:]).any():

@@ -135,7 +135,7 @@ class Trial:
         return found
 
     def verdicts(self, whole: Fit, first: int, unseen: Forked[int]) -> list[SelectedEffect]:
-        """Verdicts on effects that pass on unseen time too, up to the first that goes."""
+        """Verdicts on effects that pass on unseen time too, up to the first that goes; a model's error has a rate of one."""
         exact, verdicts = all(log.pair.exact for log in self.logs), list[SelectedEffect]()
         white = exact and whole.objective < self.settings.white_chi_square * whole.numbers  # as the noise that is known
         white = white and bool((kurtosis(whole) < self.settings.white_kurtosis).all())  # few samples may hold all squares
