@@ -90,7 +90,7 @@ def main() -> None:
 
 
 def _end_by_signals() -> None:
-    """Let the signals of a scheduler and of a terminal that closes remove temporary files and parts of uploads first."""
+    """Handle SIGTERM and SIGHUP: temporary files and parts of uploads are removed first."""
 
     def end(number: int, frame: FrameType | None) -> NoReturn:
         if ENDS[128 + number] == "SIGHUP":  # a terminal sends it, and then its shell

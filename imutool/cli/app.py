@@ -21,7 +21,7 @@ from typer.models import CommandFunctionType
 
 from imutool import __version__, registry
 from imutool.cli.overview import ABOUT, fitted, show
-from imutool.cli.parameters import FOLDERS, Group, PlainValue, current, error_with_flags, flags, instead_of, with_flags
+from imutool.cli.parameters import FOLDERS, Group, PlainValue, current, error_with_flags, flags, instead_of
 from imutool.cli.terminal import log_to_stderr, plain, progress, say, stdout_for_one, tell_end, tell_error, write_json
 from imutool.errors import INTERRUPTED, PIPE_CLOSED, ConfigError, ImutoolError, redact, was_interrupted
 from imutool.file_location import first_bytes

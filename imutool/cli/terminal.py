@@ -7,6 +7,7 @@ import math
 import os
 import re
 import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 LONGEST_LINE, LONGEST = 2000, 20_000  # letters of an error message: one with a map to complete has many lines
 LONGEST_ROW = 10_000  # letters of a table's row where nobody looks at a terminal
 NUMBER = re.compile(r"[-+]?[0-9.]+|[–?]")
+LINE_EVERY_S = 60.0
 MISSING = "–"  # in the place of a figure
 STDOUT = "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"
 
@@ -218,7 +220,7 @@ def log_to_stderr(verbose: bool, quiet: bool) -> None:
 def progress(what: str, verbose: bool, quiet: bool) -> Iterator[NamedProgress]:
     """Progress bar on stderr; the callback takes steps done, steps in all, and a word.
 
-    With --verbose the words stay as lines.
+    With --verbose the words stay as lines. Where stderr is no terminal, as in a cluster's log, a line comes each minute.
     """
     log_to_stderr(verbose, quiet)
     if quiet:
@@ -232,15 +234,18 @@ def progress(what: str, verbose: bool, quiet: bool) -> Iterator[NamedProgress]:
     with Progress(*columns, TextColumn("{task.fields[word]}"), console=err, transient=True, disable=not shown) as bar:
         task = bar.add_task(what, total=None, word="")
 
-        before = ""
+        before, told_s = "", time.monotonic()
 
         def tell(done: int, total: int, word: str) -> None:
-            nonlocal before
+            nonlocal before, told_s
             short = plain(word) if len(word) <= room else f"{plain(word)[: room - 1]}…"
             bar.update(task, completed=done, total=total, word=short)
             if word not in ("", before):
                 logger.info("%s %s", what, word)
             before = word or before
+            if not (shown or verbose) and time.monotonic() - told_s >= LINE_EVERY_S:
+                told_s = time.monotonic()
+                say(f"{what}: {100.0 * done / max(total, 1):.0f} %{f', {word}' if word else ''}", to=err)
 
         try:
             yield tell

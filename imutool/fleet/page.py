@@ -245,6 +245,7 @@ def _histograms(columns: Sequence[tuple[Sequence[float], str]], name: str) -> st
     def draw(figure: Any) -> None:
         for axes, (values, label) in zip(np.atleast_1d(figure.subplots(1, len(columns))), columns, strict=True):
             _histogram(axes, np.array(values), label, AFTER)
+            axes.set_xlim(left=max(0.0, axes.get_xlim()[0]))  # no time, speed or score is negative
 
     return svg(draw, 2.2, name)
 
@@ -253,9 +254,8 @@ def _histogram(axes: Any, values: Float64[np.ndarray, " n"], label: str, color: 
     span, largest = float(np.ptp(values)), float(np.abs(values).max())
     span = span if span > EQUAL * largest else largest or 1.0  # equal values: as wide as they are large
     first, last = values.min() - 0.05 * span, values.max() + 0.05 * span
-    first = max(first, 0.0) if values.min() >= 0.0 else first  # nothing stands below zero that may not be there
     axes.hist(values, bins=min(BINS, max(5, len(values) // 2)), range=(first, last), color=color, alpha=0.7)
-    axes.set(xlabel=label, ylabel="logs", xlim=(first, last))
+    axes.set(xlabel=label, ylabel="logs")
     axes.set_axisbelow(True)
     axes.locator_params(axis="x", nbins=5)
     axes.locator_params(axis="y", nbins=4, integer=True)

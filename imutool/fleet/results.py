@@ -183,7 +183,8 @@ class Statistics:
             self.biases["accel"].append(imu.accel_bias)
         for warning in {_without_topic(warning) for warning in result.warnings}:
             self.warnings[warning] += 1
-            self.first_warned.setdefault(warning, result.source.rpartition("/")[2])
+            name = result.target.rpartition(".")[0] or result.source.rpartition("/")[2]  # of robots, all may have a log.mcap
+            self.first_warned.setdefault(warning, name)
 
 
 def _without_topic(warning: str) -> str:

@@ -79,7 +79,10 @@ class Progress:
 
 @dataclass(frozen=True)
 class FleetReport:
-    """Outcome of a fleet: the first 1000 results with a problem are `not_whole`; `page_error` says why there is no page."""
+    """Outcome of a fleet; `not_whole` holds the first 1000 results with a problem.
+
+    `page_error` says why there is no page.
+    """
 
     source: str
     out: Location

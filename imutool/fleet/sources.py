@@ -66,9 +66,9 @@ def find(text: str, out: Location, *, bags: bool = False, once: bool = False) ->
     these logs is left out.
 
     The name of a log is its path from the folder, or from the last part of a pattern before its first wildcard; a single log
-    keeps its own name. Links are followed, also to find what lies below `out`. Hidden files are no logs, such as macOS's `._x.mcap`
-    and what lies in `.Trash`. A log without a usable name below OUT is refused, as is a folder that cannot be read, and the
-    others go on.
+    keeps its own name. Links are followed, also to find what lies below `out`. Hidden files are no logs, such as macOS's
+    `._x.mcap` and what lies in `.Trash`. A log without a usable name below OUT is refused, as is a folder that cannot be read,
+    and the others go on.
 
     Raises:
         ConfigError: nothing there, or no log in it.

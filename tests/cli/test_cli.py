@@ -15,6 +15,7 @@ from dataclasses import replace
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -343,6 +344,22 @@ def test_a_row_whose_value_is_folded_begins_in_its_first_line(
 def test_without_a_terminal_stderr_has_no_empty_line_of_the_progress(logs: Path, imutool: Run, tmp_path: Path) -> None:
     done = imutool("debias", logs / "flight_2.mcap", "out.mcap", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_without_a_terminal_a_line_of_progress_comes_each_minute(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cluster's log had nothing for hours, as of a run that hangs."""
+    clock = iter([0.0, 59.0, 60.0, 61.0, 119.0, 121.0])
+    monkeypatch.setattr(terminal, "time", Mock(monotonic=lambda: next(clock, 121.0)))
+    with terminal.progress("Fleet info", verbose=False, quiet=False) as tell:
+        for done in range(1, 5):
+            tell(done, 8, f"{done} of 8 done")
+    assert capsys.readouterr().err == "Fleet info: 25 %, 2 of 8 done\nFleet info: 50 %, 4 of 8 done\n"
+    monkeypatch.setattr(terminal, "time", Mock(monotonic=lambda: 1e6))
+    with terminal.progress("Fleet info", verbose=False, quiet=True) as tell:
+        tell(1, 8, "1 of 8 done")
+    assert capsys.readouterr().err == ""
 
 
 def test_a_verbose_line_of_progress_is_not_repeated_while_nothing_changes(capsys: pytest.CaptureFixture[str]) -> None:

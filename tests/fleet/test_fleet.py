@@ -432,7 +432,7 @@ def test_the_command_says_what_came_of_it(fleet: Path, tmp_path: Path) -> None:
 
 def test_a_page_that_cannot_be_written_hides_nothing_that_was_done(fleet: Path, tmp_path: Path) -> None:
     (fleet / "bad.mcap").write_bytes(b"no log")
-    words = ["fleet", "info", str(fleet), str(tmp_path / "out"), "--report", "/proc/page.html"]  # not even root makes a file there
+    words = ["fleet", "info", str(fleet), str(tmp_path / "out"), "--report", "/proc/page.html"]  # root makes no file there
     done = CliRunner().invoke(load(), [*words, "--json", str(tmp_path / "fleet.json")])
     assert done.exit_code == 3
     assert f"{fleet / 'bad.mcap'}: " in done.stdout

@@ -26,6 +26,14 @@ def test_what_is_said_of_logs_counts_without_their_topics_and_stays_whole() -> N
     assert statistics.first_warned["4 samples missing"] == "imu0"  # of a warning alone nobody knows the log
 
 
+def test_of_logs_with_one_name_the_folder_says_which_was_warned_of() -> None:
+    results = [
+        Result(key=robot, source=f"/fleet/{robot}/log.mcap", target=f"{robot}/log.json", status="ok", warnings=said)
+        for robot, said in (("robot_a", ()), ("robot_b", ("4 samples missing",)))
+    ]
+    assert "<td>robot_b/log</td>" in page.html(results, Settings(command="info"), seconds=1.0, source="fleet")
+
+
 def test_of_logs_that_are_not_whole_the_common_folder_stands_once() -> None:
     places = [f"/fleet/{robot}/log.mcap" for robot in ("robot_a", "robot_b")]
     results = [
@@ -83,6 +91,17 @@ def test_the_numbers_below_the_histograms_do_not_overlap(monkeypatch: pytest.Mon
             boxes = [label.get_window_extent() for label in labels]
             assert boxes
             assert all(left.x1 + LETTER < right.x0 for left, right in pairwise(boxes)), [label.get_text() for label in labels]
+
+
+def test_a_histogram_of_what_cannot_be_negative_ends_at_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    monkeypatch.setattr(page, "svg", lambda draw, height, name: draw(figure))
+    page._histograms([([0.1, 40.0, 60.0], "seconds a log"), ([50.0, 55.0, 60.0], "MB/s of one worker")], "times")
+    near, far = (axes.get_xlim()[0] for axes in figure.axes)
+    assert near == 0.0
+    assert 0.0 < far < 50.0
 
 
 @pytest.mark.parametrize("value", [-0.0137, 0.0, 9.8])

@@ -204,7 +204,9 @@ def test_hidden_files_are_no_logs(tmp_path: Path, caplog: pytest.LogCaptureFixtu
 
 
 @pytest.mark.parametrize("twins", [("Log.mcap", "log.mcap"), ("k\u00fche.mcap", "ku\u0308he.mcap")])
-def test_names_that_differ_in_case_or_unicode_form_alone_are_one_on_some_systems(tmp_path: Path, twins: tuple[str, str]) -> None:
+def test_names_that_differ_in_case_or_unicode_form_alone_are_one_on_some_systems(
+    tmp_path: Path, twins: tuple[str, str]
+) -> None:
     tree(tmp_path, *twins)
     found = find(str(tmp_path), NOWHERE)
     assert len(found.logs) == 1

@@ -214,7 +214,7 @@ def _same(a: Path, b: Path) -> bool:
 
 
 def folded(name: str) -> str:
-    """Key that names share which are one file on some systems: they differ in case or Unicode form alone."""
+    """Name without case and Unicode form: some systems take equal ones for one file."""
     return unicodedata.normalize("NFC", name).casefold()
 
 

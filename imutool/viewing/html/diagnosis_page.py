@@ -196,7 +196,8 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
         yield figure_of(
             spectrum,
             "s",
-            f"Spectrum over {over} (Welch, one-sided, mean of the axes); dashed: white noise as large as the noise floor. {legend}",
+            f"Spectrum over {over} (Welch, one-sided, mean of the axes); "
+            f"dashed: white noise as large as the noise floor. {legend}",
         )
     else:
         yield '<p class="note">Every unseen stretch is too short for a spectrum.</p>'

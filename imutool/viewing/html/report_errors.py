@@ -11,7 +11,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.viewing.html.drawing import Panel, Picture, at_least_three_ticks, legend, plain_tick_labels
 from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, text
-from imutool.viewing.html.report_paths import style_of
+from imutool.viewing.html.report_paths import length_unit, style_of
 from imutool.viewing.html.report_wording import alignment_text, format_number, format_quantity
 from imutool.viewing.model.decimation import DecimatedLine, decimate_angle, decimate_extremes
 from imutool.viewing.model.events import KINDS, Event
@@ -100,13 +100,15 @@ def _draw(
 ) -> None:
     panels = np.atleast_1d(figure.subplots(len(rows), 1, sharex=True))
     lines: list[Any] = []
-    for axes, (name, values) in zip(panels, rows.items(), strict=True):
+    scale, scaled = length_unit(min(_largest_of_each(next(iter(rows.values()))), default=0.0)) if unit == "m" else (1.0, unit)
+    for axes, (name, in_unit) in zip(panels, rows.items(), strict=True):
+        values = [error * scale for error in in_unit]
         signed = name not in {"total", "horizontal"}
         log = not signed and _needs_log_scale(values)
         beyond: list[str] = []
         for trace, t, error in zip(scored, times, values, strict=True):
             if signed and axes is not panels[0] and _leaves(error, values):
-                beyond.append(f"{trace.name} up to {format_quantity(float(np.nanmax(np.abs(error))), unit)}")
+                beyond.append(f"{trace.name} up to {format_quantity(float(np.nanmax(np.abs(error))) / scale, unit)}")
                 continue
             shown = np.where(error > 0.0, error, np.nan) if log else error  # the start is exact: log(0)
             label = f"{trace.name}: {title.lower()}, {name}" if axes is not panels[0] else trace.name
@@ -116,7 +118,7 @@ def _draw(
             lines += line if axes is panels[0] else []
         _limits(axes, values, signed=signed, log=log)
         name_off_scale(axes, beyond)
-        axes.set_ylabel(f"{name} ({unit})" if len(rows) > 1 else f"{title.lower()} ({unit})")
+        axes.set_ylabel(f"{name} ({scaled})" if len(rows) > 1 else f"{title.lower()} ({scaled})")
     panels[0].set_title(title)
     panels[-1].set(xlabel="time (s)", xlim=(0.0, data.duration_s))
     figure.align_ylabels(panels)
@@ -132,7 +134,7 @@ def name_off_scale(axes: Any, beyond: Sequence[str]) -> None:
 
 def _limits(axes: Any, values: Sequence[Line], *, signed: bool, log: bool) -> None:
     """Axis limits that keep the best and the worst run readable."""
-    tops = [float(np.nanmax(np.abs(errors))) for errors in values if np.isfinite(errors).any()]
+    tops = _largest_of_each(values)
     if log:
         axes.set_yscale("log")
         plain_tick_labels(axes.yaxis)
@@ -147,15 +149,20 @@ def _limits(axes: Any, values: Sequence[Line], *, signed: bool, log: bool) -> No
         at_least_three_ticks(axes)
 
 
+def _largest_of_each(values: Sequence[Line]) -> list[float]:
+    """Largest size of each curve that has a number."""
+    return [float(np.nanmax(np.abs(errors))) for errors in values if np.isfinite(errors).any()]
+
+
 def _needs_log_scale(values: Sequence[Line]) -> bool:
     """Whether the largest errors differ too much for one linear scale."""
-    tops = [float(np.nanmax(errors)) for errors in values if np.isfinite(errors).any()]
+    tops = _largest_of_each(values)
     return len(tops) > 1 and min(tops) > 0.0 and max(tops) > LINEAR_RATIO * min(tops)
 
 
 def _leaves(error: Line, values: Sequence[Line]) -> bool:
     """Whether a signed error is too large for the panel of the others, where it would be a stray sliver."""
-    tops = [float(np.nanmax(np.abs(other))) for other in values if np.isfinite(other).any()]
+    tops = _largest_of_each(values)
     return bool(np.isfinite(error).any()) and float(np.nanmax(np.abs(error))) > LINEAR_RATIO * min(tops) > 0.0
 
 

@@ -93,7 +93,7 @@ def _draw_paths(figure: Any, *, data: RunData, shown: Sequence[Trace], axes_of: 
     axes = figure.subplots()
     sides = list(axes_of)
     box = _box(data, shown)
-    scale, unit = _unit_of(_extent(box))
+    scale, unit = length_unit(_extent(box))
     lines = []
     for trace in data.traces:
         style = {"lw": 0.9 if trace.is_raw else 1.3, "label": trace.name, **style_of(data, trace)}
@@ -118,7 +118,7 @@ def _draw_heat(
     from matplotlib.ticker import MaxNLocator
 
     axes = figure.subplots()
-    scale, unit = _unit_of(float(np.nanmax(error))) if unit == "m" else (1.0, unit)
+    scale, unit = length_unit(float(np.nanmax(error))) if unit == "m" else (1.0, unit)
     error = error * scale
     top = float(np.nanmax(error))
     edges = np.asarray(MaxNLocator(len(LEVELS), min_n_ticks=3).tick_values(0.0, top if top > 0.0 else 1.0))
@@ -158,7 +158,7 @@ def _broken(poses: Poses) -> Points:
     return np.concatenate([piece for part in parts for piece in (part.p_wb[path_rows(part.p_wb, share)], hole)][:-1])
 
 
-def _unit_of(extent_m: float) -> tuple[float, str]:
+def length_unit(extent_m: float) -> tuple[float, str]:
     """Factor and unit for an extent in metres."""
     return (1e-3, "km") if extent_m >= KILOMETRES_M else (1.0, "m")
 

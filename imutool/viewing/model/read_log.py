@@ -15,6 +15,7 @@ from imutool.cleaning.survey import examine
 from imutool.cleaning.truth import truth_of
 from imutool.errors import DataError, LogError
 from imutool.file_location import Location
+from imutool.log_info.pose_imu_rotation import sparse_warnings
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import UNSET_FIX, ImuBatch, TwistColumns
 from imutool.mcap_io.log import Log
@@ -82,12 +83,14 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
         contents = _read(opened(path), imu, truth, notes)
     topic, derived, messages, biases_by_topic, rest, metadata = contents
     where = f"{path} {topic}"
-    survey = examine(lambda: _blocks(messages[topic]), truth_of(rest), CleaningSettings(), where=str(path), topic=topic)
+    true = truth_of(rest)
+    survey = examine(lambda: _blocks(messages[topic]), true, CleaningSettings(), where=str(path), topic=topic)
     samples, logged, why = _sound_samples(messages[topic], survey, where)
     if why:
         text = f"{survey.messages - survey.valid} of {survey.messages} messages are left out"
         notes.append(f"{topic} cannot be shown as it was recorded ({why}); as by debias --clean, {text}.")
     notes += [f"{topic}: {warning}." for warning in jump_warnings(clock_jumps(samples.t_ns))]
+    notes += [f"{warning[0].upper()}{warning[1:]}." for warning in ([] if true is None else sparse_warnings(true))]
     if survey.reasons:
         notes.append(f"{topic} cannot be trusted: {'; '.join(survey.reasons)}.")
     model, start = _model_and_start(metadata, topic)

@@ -342,6 +342,20 @@ def test_errors_are_on_one_scale_and_logarithmic_where_they_are_far_apart(seen: 
     assert np.log10(ratio[1][1:]).min() > 3.0
 
 
+def test_errors_of_many_kilometres_are_in_kilometres_where_all_are(seen: RunData) -> None:
+    raw, half, _ = seen.traces
+    far, half_far = (replace(trace, errors=scaled(of(trace), 1e5)) for trace in (raw, half))
+    for traces, unit in (((far, half_far), "km"), ((far, half), "m"), ((raw, half), "m")):
+        picture = report_errors.error_curves(replace(seen, traces=traces))
+        assert picture is not None
+        figures, shown = list[Any](), picture.panels[1]
+        drawing.svg(lambda figure: figures.append(figure) or shown.draw(figure), shown.height_inch, "x")  # noqa: B023
+        rows = figures[0].axes
+        assert [axes.get_ylabel() for axes in rows] == [f"{name} ({unit})" for name in ("total", "horizontal", "vertical")]
+        largest = max(of(trace).position_total_m.max() for trace in traces) * (1e-3 if unit == "km" else 1.0)
+        assert max(line.get_ydata().max() for line in rows[0].lines) == pytest.approx(largest)
+
+
 def of(trace: Trace) -> Errors:
     assert trace.errors is not None
     return trace.errors

@@ -216,6 +216,14 @@ def test_the_bias_in_a_log_gives_its_aided_path(debiased: Path) -> None:
     assert [trace.name for trace in load(debiased, aid="stops").traces][2:] == [f"{load(debiased).traces[1].name} aided"]
 
 
+@pytest.mark.parametrize("step", [10, 120])
+def test_poses_too_far_apart_for_their_turns_are_told(made: Recording, tmp_path: Path, step: int) -> None:
+    """A page showed 46° of error, of which the straight lines between poses at 1 Hz were a third."""
+    write(replace(made, truths={next(iter(made.truths)): made.truth.rows(slice(None, None, step))}), tmp_path / "log.mcap")
+    told = [note for note in load(tmp_path / "log.mcap").notes if note.startswith("The poses ")]
+    assert (len(told) == 1 and "are 1 s apart" in told[0]) if step == 120 else told == []
+
+
 BROKEN = {
     "out_of_order": lambda batch: late(batch, [2000], 5),
     "duplicate": lambda batch: repeated(batch, [2000, 2500]),
