@@ -114,6 +114,17 @@ def test_wheels_on_the_ground_hold_the_position(drive: Drive) -> None:
     assert rms(error_m(alone, drive.truth)) > 2.0 * rms(error_m(aided, drive.truth)), "the ground adds to the wheels"
 
 
+def test_a_vehicle_that_drives_sideways_in_its_own_frame_has_the_same_path(drive: Drive) -> None:
+    """What wheels measure is no sideways velocity that the ground forbids."""
+    few, quarter = slice(0, 4000), Rotation.from_euler("z", 90.0, degrees=True)
+    imu, start, ahead = drive.imu.rows(few), StartPose.of(drive.truth), wheels(drive)
+    turned = (Rotation.from_quat(ahead.poses.q_wb_wxyz.copy(), scalar_first=True) * quarter).as_quat(scalar_first=True)
+    aside = Odometry(replace(ahead.poses, q_wb_wxyz=turned), quarter.inv().as_matrix() @ ahead.R_vb, ahead.std_rad)
+    one, other = (aided_path(imu, start, DRIVEN, Aids(WHEELS, odometry=of)) for of in (ahead, aside))
+    assert rms(error_m(one, drive.truth.rows(few))) < 0.3
+    np.testing.assert_allclose(other.p_wb, one.p_wb, rtol=0, atol=0.1)
+
+
 def test_a_wheel_that_slips_is_not_believed(drive: Drive) -> None:
     slips = (np.arange(len(drive.speed)) % 500) < 50  # one second in ten the wheels spin
     odometry = wheels(drive, speed=np.where(slips, drive.speed + 3.0, drive.speed))
