@@ -162,7 +162,7 @@ def _fits(results: Sequence[dict[str, Any]]) -> list[str]:
 def _unfit(results: Sequence[dict[str, Any]]) -> list[ImutoolError]:
     """Errors of scored models that `debias` would refuse."""
     rows = [row for row in results if row["estimate"] == "integration" and row["fit"] and row["fit"]["verdict"] == "unfit"]
-    what, fix = "the model {model!r} does not fit this log, by its samples; the scores are in the report", "Choose another model"
+    what, fix = "the model {model!r} does not fit this log, by its samples; the report has its scores", "Choose another model"
     return [ModelError(what.format_map(row), where=row["log"], expected="a model of this sensor", fix=fix) for row in rows]
 
 
