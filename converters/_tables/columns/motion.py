@@ -129,7 +129,7 @@ def _rows(
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]] | None:
     """Times since the first sample, rates and accelerations as recorded, in order; None where they are not side by side."""
     t, gyro, accel = (columns.side_by_side(np.atleast_1d(proposal.entries[name])) for name in ("time", "gyro", "accel"))
-    if len(gyro) != len(accel):
+    if len(gyro) != len(accel) or not np.isfinite(t).all():
         return None
     t_ns = np.rint((t[:, 0] - t[0, 0]) * TIME_NS[str(proposal.entries["time_unit"])]).astype(np.int64)
     try:
