@@ -54,7 +54,7 @@ def add_gravity(columns: Columns) -> None:
 
 
 def sign_doubts(path: Path, table: TableMap) -> list[str]:
-    """Doubt about the sign of an accelerometer in g, which a file or folder named after Apple holds as CoreMotion reads it."""
+    """Doubt about the sign of an accelerometer in g, where the path names a device of Apple."""
     named = re.search(APPLE, path.name) or re.search(APPLE, path.resolve().parent.name)
     if named is None or table.accel_unit != "g" or table.accel[0].startswith("-"):
         return []

@@ -21,7 +21,7 @@ NUMBER = re.compile(
     r"|[-+]?(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?\d++)?+)"
     r"(?=(?i:[mun]?s|[cm]?m|m?g|deg|dps|k?hz|m?v|c)(?!\w)|(?![\w.^]))"  # a unit may follow without a blank
 )
-LABEL = re.compile(r"[A-Za-zµ°][^:=]*[:=]\s*[\[({'\"]*\s*$")
+LABEL = re.compile(r"[A-Za-zµ°][^:=]*([:=]\s*[\[({'\"]*|\[)\s*$")
 SIGN = re.compile(r"[-+]\s*$")  # apart from its number
 BETWEEN = re.compile(r"[:=,;|{}\[\]()<>'\"\t]+")
 STATE = re.compile(
@@ -40,7 +40,9 @@ def as_table(text: str) -> tuple[str, int, int]:
     """
     lines = [line for line in text.splitlines() if line.strip()]
     found = _as_table(lines)
-    return found if found[0] else _as_table(_samples(text))
+    if found[0].count("\n") > 2 * found[2]:
+        return found
+    return max(found, _as_table(_samples(text)), key=lambda each: each[0].partition("\n")[0].count("\t"))
 
 
 def _samples(text: str) -> list[str]:
@@ -48,7 +50,7 @@ def _samples(text: str) -> list[str]:
 
     A sample begins behind a line without words, else at a line with a time, else at the first line that comes again.
     """
-    lines = [line.strip() for line in text.splitlines()]
+    lines = text.splitlines()
     known: dict[str, list[str]] = {}
     for line in lines[:LOOKED_AT]:
         known.setdefault(_kind(line), []).append(STAMP.sub("", line))
@@ -123,8 +125,15 @@ def _names(words: tuple[str, ...]) -> list[str]:
 
 
 def _label(text: str) -> tuple[list[str], str]:
-    """Words of a number's label, and the unit of the number before it, which may stand before any mark."""
-    own, *rest = BETWEEN.split(text, maxsplit=1)
-    unit = unit_named(own.strip())
-    parts = [part.strip() for part in BETWEEN.split("".join(rest) if unit else text)]
+    """Words of a number's label, and the unit of the number before it, which may stand before any mark but that of a label."""
+    first, *words = text.split(maxsplit=1)[:2] or [""]
+    mark = BETWEEN.search(text)
+    own = text[: mark.start()] if mark else text
+    if mark and mark[0][:1] in ":=" and own.strip() == first.rstrip(":="):
+        unit = ""
+    elif unit := unit_named(own.strip()):
+        text = text[len(own) :]
+    elif unit := unit_named(first) if words else "":
+        text = words[0]
+    parts = [part.strip() for part in BETWEEN.split(text)]
     return [word for part in parts if part and part[-1].isalnum() for word in part.split()], unit
