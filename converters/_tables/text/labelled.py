@@ -14,7 +14,7 @@ from .delimited import LOOKED_AT
 from .names import unit_named
 
 MIN_ROWS, MIN_SHARE = 5, 0.3  # of the lines looked at that have the same words; status lines may stand between
-MIN_NUMBERS, MIN_LABELS = 4, 2  # in a row
+MIN_NUMBERS, MIN_LABELS, OF_AN_IMU = 4, 2, 6  # in a row
 LONGEST_LINE, LONGEST_LABEL = 2_000, 80  # characters; the search for labels costs the square of their length
 NUMBER = re.compile(
     r"(?<![\w.^/])(\d{4}-\d\d-\d\d[T ]\d\d?:\d\d:\d\d(?:[.,]\d+)?Z?|\d\d?:\d\d:\d\d(?:[.,]\d+)?"
@@ -40,7 +40,7 @@ def as_table(text: str) -> tuple[str, int, int]:
     """
     lines = [line for line in text.splitlines() if line.strip()]
     found = _as_table(lines)
-    if found[0].count("\n") > 2 * found[2]:
+    if found[0].partition("\n")[0].count("\t") >= OF_AN_IMU - 1:
         return found
     return max(found, _as_table(_samples(text)), key=lambda each: each[0].partition("\n")[0].count("\t"))
 
