@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
 from imutool.converters import table
-from imutool.converters._tables.columns.headerless import as_table
 from imutool.converters._tables.columns.units import raw_counts
+from imutool.converters._tables.text.labelled import as_table
 from imutool.converters._tables.text.names import split_name
 from imutool.errors import ConfigError, DataError
 from imutool.recording.gyro_steps import unit_by_steps
@@ -472,13 +472,13 @@ def test_a_wider_table_without_header_gets_a_guess_to_confirm(tmp_path):
 
 
 def test_the_motion_shows_which_columns_of_a_wide_table_are_the_imu(tmp_path):
-    """As KAIST's xsens_imu.csv: time, quaternion, angles, gyro, accelerometer, magnetometer."""
+    """Time, angles, quaternion, gyro, accelerometer, magnetometer, in an order of no known data set."""
     t_s = np.arange(3000) * 0.01
     turn = Rotation.from_euler("xyz", 0.8 * np.sin(t_s[:, None] * [0.9, 1.3, 0.7]))
     noise = np.random.default_rng(3).normal(0.0, 0.002, (4, 3000, 3))
     gyro = np.vstack([(turn[:-1].inv() * turn[1:]).as_rotvec() * 100.0, np.zeros(3)])
     sensors = [gyro + noise[0], turn.inv().apply([0.0, 0.0, 9.8]) + noise[1], turn.inv().apply([0.2, 0.0, -0.4]) + noise[2]]
-    rows = np.column_stack([t_s, turn.as_quat(), turn.as_euler("xyz"), *sensors])
+    rows = np.column_stack([t_s, turn.as_euler("xyz"), turn.as_quat(), *sensors])
     (tmp_path / "imu.csv").write_text("\n".join(",".join(map(repr, row)) for row in rows.tolist()) + "\n")
     with pytest.raises(ConfigError) as caught:
         read(tmp_path / "imu.csv")
@@ -1059,3 +1059,58 @@ def test_android_s_names_of_chips_say_whether_they_wake_the_phone(tmp_path):
     names = [f"icm4x6xx {sensor} Non-wakeup.{axis}" for sensor in ("Accelerometer", "Gyroscope") for axis in "xyz"]
     log = read(write_csv(tmp_path / "imu.csv", ["Timestamp", *names], [1.6e12 + 1e3 * T_S, *ACCEL_G.T, *(COUNTS / 131).T]))
     np.testing.assert_allclose(log.imus["/imu0"].gyro, np.deg2rad(COUNTS / 131), rtol=1e-5)
+
+
+SAMPLES = {  # a line each, `{t}` the seconds
+    "a serial monitor": (
+        "15:04:{t:06.3f} -> Acceleration X: {a[0]}, Y: {a[1]}, Z: {a[2]} g",
+        "15:04:{t:06.3f} -> Rotation X: {g[0]}, Y: {g[1]}, Z: {g[2]} rad/s",
+        "15:04:{t:06.3f} -> Temperature: 28.50 degC",
+        "15:04:{t:06.3f} -> ",
+    ),
+    "dashes": ("Time: {t:.3f} s", "Accel [g]: {a[0]} {a[1]} {a[2]}", "Gyro [rad/s]: {g[0]} {g[1]} {g[2]}", "-----"),
+    "four numbers each": (
+        "15:04:{t:06.3f} -> X-acceleration: {a[0]} g Y-acceleration: {a[1]} g Z-acceleration: {a[2]} g",
+        "15:04:{t:06.3f} -> X-gyro: {g[0]} rad/s Y-gyro: {g[1]} rad/s Z-gyro: {g[2]} rad/s",
+    ),
+    "letters": (
+        "15:04:{t:06.3f} -> G: {g[0]}, {g[1]}, {g[2]} rad/s",
+        "15:04:{t:06.3f} -> A: {a[0]}, {a[1]}, {a[2]} g",
+        "15:04:{t:06.3f} -> ",
+    ),
+    "brackets": (
+        "15:04:{t:06.3f} -> Acc (g) [ {a[0]:08.4f}, {a[1]:08.4f}, {a[2]:08.4f} ], Gyr (rad/s) [ {g[0]}, {g[1]}, {g[2]} ]",
+    ),
+    "dates": (
+        "2023-04-17 15:24:{t:06.3f}",
+        "Acceleration (g): {a[0]}, {a[1]}, {a[2]}",
+        "Rotation Rate (rad/s): {g[0]}, {g[1]}, {g[2]}",
+    ),
+}
+
+
+@pytest.mark.parametrize("cut", [0, 1])
+@pytest.mark.parametrize("name", SAMPLES)
+def test_the_lines_of_a_sample_stand_below_one_another(tmp_path, name, cut):
+    """A board printed them; the first sample may be cut where something shows where the next begins."""
+    lines, cut = SAMPLES[name], 0 if name == "four numbers each" else cut
+    gyro = 0.01 * COUNTS
+    printed = [line.format(t=t, a=a, g=g) for t, a, g in zip(T_S, ACCEL_G, gyro, strict=True) for line in lines]
+    (tmp_path / "log.txt").write_text("\n".join(printed[cut:]) + "\n")
+    imu = read(tmp_path / "log.txt").imus["/imu0"]
+    np.testing.assert_allclose(np.diff(imu.t_ns), 1e7)
+    np.testing.assert_allclose(imu.gyro, gyro[cut:])
+    np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G[cut:])
+
+
+def test_sensors_side_by_side_that_end_in_between_are_refused_without_a_warning(tmp_path):
+    """An app joined sessions, in each of which the gyro ended first; NumPy warned of its missing times."""
+    late = [f"{t:.0f}" if n % 100 < 90 else "" for n, t in enumerate(1e9 * T_S + 5e6)]
+    rows = [
+        ",".join(["15", f"{1e9 * t:.0f}", *map(str, a), end, *(map(str, 1e-3 * g) if end else [""] * 3)])
+        for t, a, end, g in zip(T_S, 9.81 * ACCEL_G, late, COUNTS, strict=True)
+    ]
+    header = "Record Id,Acc Timestamp,AccX,AccY,AccZ,Gyro Timestamp,GyroX,GyroY,GyroZ"
+    (tmp_path / "imu.csv").write_text("\n".join([header, *rows]) + "\n")
+    with pytest.raises((ConfigError, DataError), match="Gyro Timestamp"):
+        read(tmp_path / "imu.csv")

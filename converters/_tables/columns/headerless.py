@@ -1,23 +1,17 @@
-"""Names for the columns of text without a header: by its values, or by words in its rows.
-
-A board prints the words: `Acc X:-0.22, Acc Y:-0.11`; `ax=0.1 g ay=0.2 g`; `{'acc': {'x': 0.1, 'y': 0.2}, 't': 1}`;
-`Gyro: (0.1, 0.2, 0.3)`.
-"""
+"""Names for the columns of a table without a header, by its values."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections import Counter
-from itertools import pairwise, product
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from imutool.recording.joined_imu import unit_by_gravity
 
-from ..text.delimited import LOOKED_AT, Columns
-from ..text.names import unit_named
+from ..text.delimited import Columns
 from .times import rises, units_of_time, usual_step
 from .units import GYRO_SI, TIME_NS, gravity_units
 
@@ -47,24 +41,9 @@ XSENS = [  # of MulRan, HeLiPR and the KAIST urban data, whose tools name them s
     *(f"linear_acceleration.{axis}" for axis in "xyz"),
     *(f"magnetic_field.{axis}" for axis in "xyz"),
 ]
-MIN_ROWS, MIN_SHARE = 5, 0.3  # of the lines looked at that have the same words; status lines may stand between
 MIN_TENTH = 0.5  # of the median length, which 90 % of an accelerometer's readings exceed
-MIN_NUMBERS, MIN_LABELS = 4, 2  # in a row
 DIRECTION = 1e-3  # by which rounding changes a direction, or its length of 1
 WIDE, MAX_ROWS = 7, 20_000  # more columns than a time and an IMU; rows that are compared
-LONGEST_LINE, LONGEST_LABEL = 2_000, 80  # characters; the search for labels costs the square of their length
-NUMBER = re.compile(
-    r"(?<![\w.^/])(\d{4}-\d\d-\d\d[T ]\d\d?:\d\d:\d\d(?:[.,]\d+)?Z?|\d\d?:\d\d:\d\d(?:[.,]\d+)?"
-    r"|[-+]?(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?\d++)?+)"
-    r"(?=(?i:[mun]?s|[cm]?m|m?g|deg|dps|k?hz|m?v|c)(?!\w)|(?![\w.^]))"  # a unit may follow without a blank
-)
-LABEL = re.compile(r"[A-Za-zµ°][^:=]*[:=]\s*[\[({'\"]*\s*$")
-SIGN = re.compile(r"[-+]\s*$")  # apart from its number
-BETWEEN = re.compile(r"[:=,;|{}\[\]()<>'\"\t]+")
-STATE = re.compile(
-    r"(?<=[:=])\s*([A-Z\d][A-Z\d_]+|(?i:true|false|yes|no|ok))(?=\s*[,;|])"
-)  # in place of a number: `GPS: NO_FIX,`
-AXIS = re.compile(r"[xyzw]", re.IGNORECASE)
 
 
 class _Halves(NamedTuple):
@@ -227,54 +206,3 @@ def name_headerless(columns: Columns) -> None:
     columns.texts = {name[column]: texts for column, texts in columns.texts.items()}
     columns.units = {name[column]: unit for column, unit in columns.units.items() if column in name}
     columns.remarks.notes.append(why)
-
-
-def as_table(text: str) -> tuple[str, int, int]:
-    """The text as a table, and how many lines are left out: damaged rows, and others.
-
-    Without such rows the table is empty.
-    """
-    lines = [line for line in text.splitlines() if line.strip()]
-    counts = Counter(words for line in lines[:LOOKED_AT] if (words := _words(line)))
-    words, count = max(counts.items(), key=lambda each: each[1], default=((), 0))
-    if count < max(MIN_ROWS, MIN_SHARE * len(lines[:LOOKED_AT])):
-        return "", 0, 0
-    rows = ["\t".join(match[1] for match in NUMBER.finditer(line)) for line in lines if _words(line) == words]
-    labels = {match[0].strip() for text in words if (match := LABEL.search(text[-LONGEST_LABEL:]))}
-    row = re.compile("|".join(rf"(?<!\w){re.escape(label)}" for label in labels))
-    damaged = sum(_words(line) != words and row.search(line) is not None for line in lines)
-    return "\n".join(["\t".join(_names(words)), *rows]) + "\n", damaged, len(lines) - len(rows) - damaged
-
-
-def _words(line: str) -> tuple[str, ...]:
-    """What stands before each number and behind the last; empty where fewer than two numbers have a label."""
-    if len(line) > LONGEST_LINE:
-        return ()
-    words = tuple(
-        " ".join(STATE.sub(" *", text).split()) for text in NUMBER.split(line)[::2]
-    )  # numbers may be padded to a width
-    named = sum(bool(LABEL.search(text[-LONGEST_LABEL:])) for text in words[:-1])
-    return words if len(words) > MIN_NUMBERS and named >= MIN_LABELS and not any(map(SIGN.search, words)) else ()
-
-
-def _names(words: tuple[str, ...]) -> list[str]:
-    """Names of the numbers: an axis alone is of the group before it, and numbers that follow without a label are counted."""
-    group, label, place, names = "", "", 0, list[str]()
-    for (own, _), (following, unit) in pairwise(map(_label, words)):
-        if own:
-            is_axis = AXIS.fullmatch(own[-1])
-            group = " ".join(own[:-1] if is_axis else own) or group
-            label, place = f"{group} {own[-1]}".strip() if is_axis else group, 0
-        counted = label and (place or (not following and len(names) + 2 < len(words)))
-        name = f"{label}_{place}" if counted else label or f"number {len(names) + 1}"
-        names.append(f"{name} [{unit}]" if unit else name)
-        place += 1
-    return names
-
-
-def _label(text: str) -> tuple[list[str], str]:
-    """Words of a number's label, and the unit of the number before it, which may stand before any mark."""
-    own, *rest = BETWEEN.split(text, maxsplit=1)
-    unit = unit_named(own.strip())
-    parts = [part.strip() for part in BETWEEN.split("".join(rest) if unit else text)]
-    return [word for part in parts if part and part[-1].isalnum() for word in part.split()], unit

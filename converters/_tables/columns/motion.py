@@ -54,7 +54,7 @@ def add_gravity(columns: Columns) -> None:
 
 
 def sign_doubts(path: Path, table: TableMap) -> list[str]:
-    """Doubt about the sign of an accelerometer in g, which a file or folder named after Apple holds as CoreMotion reads it."""
+    """Doubt about the sign of an accelerometer in g, where the path names a device of Apple."""
     named = re.search(APPLE, path.name) or re.search(APPLE, path.resolve().parent.name)
     if named is None or table.accel_unit != "g" or table.accel[0].startswith("-"):
         return []
@@ -129,7 +129,7 @@ def _rows(
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]] | None:
     """Times since the first sample, rates and accelerations as recorded, in order; None where they are not side by side."""
     t, gyro, accel = (columns.side_by_side(np.atleast_1d(proposal.entries[name])) for name in ("time", "gyro", "accel"))
-    if len(gyro) != len(accel):
+    if len(gyro) != len(accel) or not np.isfinite(t).all():
         return None
     t_ns = np.rint((t[:, 0] - t[0, 0]) * TIME_NS[str(proposal.entries["time_unit"])]).astype(np.int64)
     try:

@@ -14,11 +14,12 @@ from imutool.errors import DataError, required
 
 from ..._archive import refusing
 from ..._source import head
-from ..columns.headerless import as_table, name_headerless
+from ..columns.headerless import name_headerless
 from ..columns.motion import add_gravity
 from ..columns.times import fill_own_times, join_gps_weeks, read_clocks_and_days
 from ..text.blocks import first_block, text_of
 from ..text.delimited import FIRSTS, Columns, add_fields, is_text_table, read_csv, read_plain
+from ..text.labelled import as_table
 from ..text.names import group_of, is_named_time, leaf_of, tells_apart
 from ..text.numbers import is_number
 from ..text.packed import goes_back, read_bytes, text_head
