@@ -15,9 +15,10 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, wraps
 from io import BufferedReader
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 from imutool.errors import DataError
 
@@ -35,6 +36,25 @@ CHUNK = MIB
 MAX_HEADER = 4 * MIB  # one tar header record; tarfile reads long names whole, whatever their declared length
 HEAD = 4096  # bytes of a table that tell which data set it is from
 BLOCK = 512  # tar's unit
+
+
+Found = TypeVar("Found")
+
+
+def once_per_content(maximum: int) -> Callable[[Callable[[Path], Found]], Callable[[Path], Found]]:
+    """Decorator that keeps what a function finds in up to `maximum` files, until they change."""
+
+    def kept(find: Callable[[Path], Found]) -> Callable[[Path], Found]:
+        known = lru_cache(maximum)(lambda path, _mtime_ns, _size: find(path))
+
+        @wraps(find)
+        def found(path: Path) -> Found:
+            status = path.stat()
+            return known(path, status.st_mtime_ns, status.st_size)
+
+        return found
+
+    return kept
 
 
 @dataclass
@@ -56,13 +76,12 @@ def list_members(path: Path) -> Listing:
         DataError: empty, damaged, cut off, hostile, or a member larger than its kind may be; the member is named.
     """
     with refusing(path):
-        status = path.stat()
-    return _listing(path, status.st_mtime_ns, status.st_size)
+        return _listing(path)
 
 
-@lru_cache(maxsize=64)  # three converters ask about the same archive, and a tar.gz takes its time
-def _listing(path: Path, mtime_ns: int, size: int) -> Listing:  # the key notices a changed file
-    if size == 0:
+@once_per_content(64)  # three converters ask about the same archive, and a tar.gz takes its time
+def _listing(path: Path) -> Listing:
+    if path.stat().st_size == 0:
         raise DataError("is empty", where=path, expected="an archive")
     return _list_zip(path) if is_zip(path) else _list_tar(path)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from imutool.errors import ConfigError, DataError, LogError, required
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars
 
 from . import Sequence, _asl
+from ._archive import once_per_content
 from ._asl_table import Table
 from ._ros_types import ros2_name
 from ._source import is_bag
@@ -50,14 +51,13 @@ def _known(path: Path) -> tuple[dict[str, str], str]:
     A bag without an index is scanned completely.
     """
     try:
-        status = path.stat()
+        return _known_once(path)
     except OSError as error:
         raise DataError(f"cannot be read ({error.strerror})", where=path) from error
-    return _known_once(path, status.st_mtime_ns, status.st_size)
 
 
-@lru_cache(maxsize=64)  # three converters ask about the same bag
-def _known_once(path: Path, mtime_ns: int, size: int) -> tuple[dict[str, str], str]:  # the key notices a changed file
+@once_per_content(64)  # three converters ask about the same bag
+def _known_once(path: Path) -> tuple[dict[str, str], str]:
     with _open(path) as bag:
         wrong = ""
         if not bag.indexed:

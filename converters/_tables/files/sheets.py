@@ -11,13 +11,13 @@ import datetime
 import re
 import zipfile
 from collections.abc import Callable, Iterator
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from imutool.errors import DataError, required
 
-from ..._archive import MAX_RATIO, RATIO_FREE, refusing
+from ..._archive import MAX_RATIO, RATIO_FREE, once_per_content, refusing
 from ..._source import head
 from ..text.delimited import Columns, is_text_table, read_csv
 from .sensors import SENSORS, name_columns, pairs_among, sensors_among
@@ -62,8 +62,7 @@ def _sheets(path: Path) -> Iterator[tuple[str, str]]:
     """Name of each sheet that is shown, and its rows as lines of text."""
     calamine = required("python_calamine", "tables", package="python-calamine", where=path, user="reading it")
     if head(path).startswith(ZIP):
-        status = path.stat()
-        _check_members(path, status.st_mtime_ns, status.st_size)
+        _check_members(path)
     try:
         with calamine.CalamineWorkbook.from_path(str(path)) as book:
             kind = calamine.SheetTypeEnum.WorkSheet, calamine.SheetVisibleEnum.Visible
@@ -76,8 +75,8 @@ def _sheets(path: Path) -> Iterator[tuple[str, str]]:
         ) from error
 
 
-@lru_cache(maxsize=64)  # sheets are looked at, then read
-def _check_members(path: Path, mtime_ns: int, size: int) -> None:  # the key notices a changed file
+@once_per_content(64)  # sheets are looked at, then read
+def _check_members(path: Path) -> None:
     with refusing(path), zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
             with archive.open(member) as file:

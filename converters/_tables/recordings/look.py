@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 import re
-from functools import lru_cache
 from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
 
 from imutool.errors import ConfigError, DataError
 
+from ..._archive import once_per_content
 from ..._source import head
 from ..columns.headerless import perhaps
 from ..columns.pose_names import has_poses, has_turns, pose_leaves
@@ -52,21 +52,16 @@ class Seen(NamedTuple):
     header: tuple[str, ...] = ()  # names of all columns, if the table states them
 
 
+@once_per_content(4096)
 def look(path: Path) -> Seen:
-    """What the first rows of a text show, or a table of up to `MAX_LOOKED` bytes, once."""
-    status = path.stat()
-    return _looked(path, status.st_mtime_ns, status.st_size)
-
-
-@lru_cache(maxsize=4096)
-def _looked(path: Path, mtime_ns: int, size: int) -> Seen:  # the key notices a changed file
+    """What the first rows of a text show, or a table of up to `MAX_LOOKED` bytes."""
     columns, kind = Columns(), kind_of(head(path), path)
     start = _start(path, kind)
     if start and (is_mocap(start) or not kind):
         read_csv(start, columns, path, minimum=MIN_NUMBERS if kind else NARROW)
     elif start:
         read_text(start, columns, path)
-    elif kind not in ("csv", "") and size <= MAX_LOOKED:
+    elif kind not in ("csv", "") and path.stat().st_size <= MAX_LOOKED:
         try:
             columns = load(path, kind)
         except (DataError, ConfigError) as error:
@@ -83,16 +78,11 @@ def _looked(path: Path, mtime_ns: int, size: int) -> Seen:  # the key notices a 
     return Seen(is_imu, bool(perhaps(columns)), has_poses(columns), turns, is_captured, "time" in entries, header)
 
 
+@once_per_content(4096)
 def span_ns(path: Path) -> tuple[int, int] | None:
     """First and last time of a table of text, by its first rows and its last."""
-    status = path.stat()
-    return _spanned(path, status.st_mtime_ns, status.st_size)
-
-
-@lru_cache(maxsize=4096)
-def _spanned(path: Path, mtime_ns: int, size: int) -> tuple[int, int] | None:
     with path.open("rb") as file:
-        file.seek(max(0, size - LAST_BYTES))
+        file.seek(max(0, path.stat().st_size - LAST_BYTES))
         last = text_of(file.read()).rstrip().rpartition("\n")[2]
     columns, start = Columns(), text_of(head(path)).rpartition("\n")[0]
     if "\0" in start or opener(head(path)):
