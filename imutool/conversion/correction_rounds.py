@@ -61,7 +61,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             mount = None if frame_id or (survey.mount == np.eye(3)).all() else survey.mount
             if frame_id:  # the next round judges by the corrected poses
                 survey = replace(survey, axes=AS_RECORDED)
-            elif mount is not None and _one_is_straight(log, before, survey.pose_topic):
+            elif mount is not None and any(is_straight(log, ImuSamples(log, each), survey.pose_topic) for each in before):
                 survey, mount = replace(survey, axes=np.stack([mount] * 2)), None
             before.append(topic)
             hidden = frame_id or survey.pose_delay_ns or survey.quaternions or (survey.matrices != np.eye(3)).any()
@@ -95,11 +95,6 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
     texts = {topic: "; ".join(lines) for topic, lines in notes.items()}
     poses = world, frame_id, late_ns, body, pose_topic, unit, quaternions, copies
     return Corrections(imus, *poses, stamps, own_types, texts, kept)
-
-
-def _one_is_straight(log: Log, imus: Sequence[str], pose_topic: str) -> bool:
-    """Whether an IMU lies as the body of the poses does."""
-    return any(is_straight(log, ImuSamples(log, topic), pose_topic) for topic in imus)
 
 
 def _gyro_axes(log: Log, topic: str, pose_topic: str) -> Float64[np.ndarray, "3 3"]:

@@ -73,7 +73,7 @@ def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", 
         streams: list[Iterator[tuple[Chunk, str | None]]] = [((chunk, None) for chunk in chunks(g)) for g in groups]
         for chunk, packing in heapq.merge(*streams, stream.chunks(), key=lambda item: item[0].start_ns):
             log.chunk(chunk, packing)
-        for topic, (log_times, imu) in pairs.joined(source.remarks):
+        for topic, log_times, imu in pairs.joined(source.remarks):
             series = Series(log.channel(topic, schemas.IMU), log_times, (imu.t_ns, imu.gyro, imu.accel), _encode_body)
             for chunk in chunks([series]):
                 log.chunk(chunk)

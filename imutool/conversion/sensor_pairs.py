@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,13 +18,6 @@ from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import MessageLog, MessageTopic, Remarks
 
 AT_ONCE = 1000  # messages that are decoded together
-
-
-class LoggedImu(NamedTuple):
-    """IMU with the log times of its samples, which are those of the gyro's messages."""
-
-    log_times: Int64[np.ndarray, " n"]
-    imu: Imu
 
 
 class SensorPairs:
@@ -84,8 +76,8 @@ class SensorPairs:
             vectors = np.array(values, np.float64)
             self._columns[topic].append((np.array(log_times, np.int64), np.array(stamps, np.int64), vectors, vectors))
 
-    def joined(self, remarks: Remarks) -> Iterator[tuple[str, LoggedImu]]:
-        """IMU topics with their samples; a pair that cannot be joined is remarked on."""
+    def joined(self, remarks: Remarks) -> Iterator[tuple[str, Int64[np.ndarray, " n"], Imu]]:
+        """IMU topics, the log times of the gyro's messages, and samples; a pair that cannot be joined is remarked on."""
         for whole, (gyro_topic, accel_topic) in self.pairs.items():
             for topic in (gyro_topic, accel_topic):
                 if self._waiting[topic]:
@@ -103,7 +95,7 @@ class SensorPairs:
                 continue
             axes = ", in FLU" if gyro_topic in self._px4 else ""
             remarks.notes += [f"{whole} is made of {gyro_topic} and {accel_topic}{axes}", *notes]
-            yield whole, LoggedImu(log_times[rows], imu)
+            yield whole, log_times[rows], imu
 
     def _samples(
         self, topic: str

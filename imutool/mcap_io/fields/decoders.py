@@ -72,7 +72,9 @@ def decoder_of(log: Log, topic: Topic) -> Decoder:
         parse = _parse_idl if topic.schema_encoding == "ros2idl" else ros2_definition.parse
         with log.named(topic.name):
             definition = parse(name, data)
-            _check_alone(log, topic, definition, parse)
+            numbers = {channel.schema_id for channel in log.index.channels.values() if channel.topic == topic.name}
+            texts = {log.index.schemas[number].data for number in numbers if number in log.index.schemas}
+            ros2_definition.refuse_two(topic.name, name, [definition, *(parse(name, text) for text in texts)])
             return Described(definition, topic.message_encoding)
     if topic.message_encoding not in REFLECTED:
         raise LogError(
@@ -92,17 +94,6 @@ def decoder_of(log: Log, topic: Topic) -> Decoder:
     return Parsed(form, topic.message_encoding)
 
 
-def _check_alone(log: Log, topic: Topic, definition: Definition, parse: Callable[[str, bytes], Definition]) -> None:
-    """Refuse a topic whose channels define messages of one name differently, as in merged logs.
-
-    Raises:
-        LogError: they do.
-    """
-    numbers = {channel.schema_id for channel in log.index.channels.values() if channel.topic == topic.name}
-    texts = {log.index.schemas[number].data for number in numbers if number in log.index.schemas}
-    ros2_definition.refuse_two(topic.name, topic.schema_name, [definition, *(parse(topic.schema_name, t) for t in texts)])
-
-
 def _parse_idl(schema_name: str, text: bytes) -> Definition:
     """Fields of a message and of nested ones from a `ros2idl` definition. Needs rosbags.
 
@@ -113,11 +104,7 @@ def _parse_idl(schema_name: str, text: bytes) -> Definition:
         raise LogError(f"the definition of {schema_name} has {len(text)} bytes", expected=f"at most {ros2_definition.MAX_TEXT}")
     try:
         from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_typestore
-    except ImportError as error:
-        raise LogError(
-            "a ros2idl definition needs rosbags, which is not installed", fix="pip install 'imutool[bags]'"
-        ) from error
-    try:
+
         store = get_typestore(Stores.EMPTY)
         for part in ros2_definition.SEPARATOR.split(text.decode(errors="replace")):
             if bare := _NO_IDL.sub("", part).strip():
@@ -125,7 +112,7 @@ def _parse_idl(schema_name: str, text: bytes) -> Definition:
         msg, _ = store.generate_msgdef(schema_name, ros_version=2)
     except ImportError as error:
         raise LogError(
-            "a definition in IDL needs rosbags, which is not installed", fix="pip install 'imutool[bags]'"
+            "a ros2idl definition needs rosbags, which is not installed", fix="pip install 'imutool[bags]'"
         ) from error
     except (TypesysError, KeyError, ValueError) as error:
         raise LogError(f"the definition of {schema_name} is not readable", expected="IDL as ROS 2 records it") from error

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
 
@@ -49,17 +49,6 @@ class LogContents:
     opened: Callable[[Location], Log] = Log
 
 
-class _Read(NamedTuple):
-    """Result of one pass over the log: messages as recorded, and a recording of all but the IMU."""
-
-    topic: str
-    derived: list[str]
-    messages: dict[str, ImuBatch]
-    biases_by_topic: dict[str, list[TwistColumns]]
-    rest: Recording
-    metadata: list[tuple[str, dict[str, str]]]
-
-
 def read_log(path: Location, *, imu: str | None = None, truth: str | None = None) -> LogContents:
     """Read a log for viewing.
 
@@ -84,7 +73,9 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
     topic, derived, messages, biases_by_topic, rest, metadata = contents
     where = f"{path} {topic}"
     true = truth_of(rest)
-    survey = examine(lambda: _blocks(messages[topic]), true, CleaningSettings(), where=str(path), topic=topic)
+    firsts = range(0, len(messages[topic].stamp_ns), BLOCK)
+    blocks = partial(map, lambda first: rows_of(messages[topic], slice(first, first + BLOCK)), firsts)
+    survey = examine(blocks, true, CleaningSettings(), where=str(path), topic=topic)
     samples, logged, why = _sound_samples(messages[topic], survey, where)
     if why:
         text = f"{survey.messages - survey.valid} of {survey.messages} messages are left out"
@@ -109,7 +100,11 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
     return LogContents(replace(rest, imu=shown), logged, tuple(debiased), survey, metadata, tuple(notes), opened)
 
 
-def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> _Read:
+def _read(
+    opened: Log, imu: str | None, truth: str | None, notes: list[str]
+) -> tuple[str, list[str], dict[str, ImuBatch], dict[str, list[TwistColumns]], Recording, list[tuple[str, dict[str, str]]]]:
+    """IMU topic and its derived ones, messages and biases as recorded, a recording of all else, and the metadata."""
+
     def refused(name: str, error: LogError) -> None:
         notes.append(f"The true poses on {name} are left out: {error.what}.")
 
@@ -130,7 +125,7 @@ def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> 
         metadata = log.metadata_records()
         if isinstance(log, RecoveredLog):
             notes += [f"The log is damaged; {line}." for line in describe(log.losses.plain())]
-    return _Read(topic, derived, messages, biases_by_topic, rest, metadata)
+    return topic, derived, messages, biases_by_topic, rest, metadata
 
 
 def _messages(
@@ -158,11 +153,6 @@ def _whole(batches: list[ImuBatch]) -> ImuBatch:
     for column in columns:  # so that the samples need no copy
         column.flags.writeable = False
     return ImuBatch._make([*columns, frame_id])
-
-
-def _blocks(messages: ImuBatch) -> Iterator[ImuBatch]:
-    for first in range(0, len(messages.stamp_ns), BLOCK):
-        yield rows_of(messages, slice(first, first + BLOCK))
 
 
 def _sound_samples(messages: ImuBatch, survey: Survey, where: str) -> tuple[Imu, LogTimes, str]:
