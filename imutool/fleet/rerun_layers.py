@@ -75,16 +75,12 @@ def logs_of(folders: Sequence[Path]) -> list[FleetLog]:
             ) from error
         for row in rows:
             if row.get("target"):
-                _check_inside(row["target"], table)
+                if Path(row["target"]).is_absolute() or ".." in Path(row["target"]).parts:  # layers are named by it
+                    what, expected = f"names the target {row['target']}", "a file in the folder of the fleet"
+                    raise ConfigError(what, where=table, expected=expected)
                 log = _log(folder, row)
                 logs[log.name] = _joined(logs.get(log.name), log)
     return list(logs.values())
-
-
-def _check_inside(target: str, table: Path) -> None:
-    """Refuse a target outside its fleet's folder: layers are named by it."""
-    if Path(target).is_absolute() or ".." in Path(target).parts:
-        raise ConfigError(f"names the target {target}", where=table, expected="a file in the folder of the fleet")
 
 
 def _log(folder: Path, row: Mapping[str, Any]) -> FleetLog:

@@ -7,7 +7,7 @@ stamps that go back, repeated stamps, and values that are not finite.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -26,7 +26,7 @@ from imutool.log_info.imu_motion import ImuMotion
 from imutool.log_info.imu_samples import ImuSamples, read_imus
 from imutool.log_info.pose_coverage import coverage, transforms
 from imutool.log_info.pose_imu_rotation import Agreement, sparse_warnings
-from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
+from imutool.log_info.report import ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.joined_imu import JOIN_VECTORS
 from imutool.mcap_io.codec.reflection import LOG_TIME, Reflected
@@ -71,7 +71,10 @@ def describe(log: RecoveredLog, *, check: bool) -> LogInfo:
     if check:
         log.check()
     counts = {topic.name: topic.count for topic in log.topics.values()}
-    topics = [_topic(*found) for found in zip(log.topics.values(), clocks(log.stamps_of, counts), strict=True)]
+    topics = [
+        TopicInfo(topic.name, topic.own_schema or topic.schema_name, topic.message_encoding, count, *clock)
+        for topic, (count, clock) in zip(log.topics.values(), clocks(log.stamps_of, counts), strict=True)
+    ]
     refused: list[str] = []
     true_poses = read_truth(log, lambda topic, error: refused.append(f"{topic}: {error.what}"))
     every = log.with_schema((schemas.IMU,))
@@ -115,11 +118,6 @@ def _made_by_convert(log: Log, *, has_imu: bool, has_poses: bool) -> list[str]:
     lacking = {"poses": not has_poses, "an IMU": not has_imu}
     made = {topic.name: CONVERTIBLE.get(topic.own_schema or topic.schema_name, "") for topic in log.topics.values()}
     return [f"imutool convert LOG OUT makes {what} of {name}" for name, what in made.items() if lacking.get(what)]
-
-
-def _topic(topic: Topic, found: tuple[int, Clock]) -> TopicInfo:
-    count, clock = found
-    return TopicInfo(topic.name, topic.own_schema or topic.schema_name, topic.message_encoding, count, *clock)
 
 
 def _coverages(log: Log, imu: Topic | None) -> Iterator[TruthInfo]:
@@ -183,31 +181,21 @@ def _imu(
         **imu.recorded.clock()._asdict(),
         **imu.counts,
         saturation_rule=saturation.RULE,
-        stationary_s=rest.seconds,
-        stationary=rest.stretches,
-        accel_at_rest_m_s2=rest.accel_m_s2,
-        noise=rest.noise,
+        **rest,
     ), {} if misread else {name: turns.agreement() for name, turns in motion.turns.items()}
 
 
-class _Rest(NamedTuple):
-    seconds: float
-    stretches: list[Interval]
-    accel_m_s2: float | None
-    noise: ImuNoise | None
-
-
-def _rest(imu: ImuSamples, blocks: Blocks) -> _Rest:
-    """Stationary stretches, the specific force there, and the noise."""
+def _rest(imu: ImuSamples, blocks: Blocks) -> dict[str, Any]:
+    """Entries of a report: stationary stretches, the specific force there, and the noise."""
     found = resting_blocks(blocks)
     stretches = [Interval(int(blocks.first_ns[a]), int(blocks.last_ns[b - 1])) for a, b in found]
     norms = [float(np.linalg.norm(blocks.mean[a:b, 3:].mean(axis=0))) for a, b in found]
-    return _Rest(
-        seconds=float(sum(stretch.last_ns - stretch.first_ns for stretch in stretches)) * 1e-9,
-        stretches=stretches,
-        accel_m_s2=float(np.average(norms, weights=[b - a for a, b in found])) if found else None,
-        noise=_noise(imu, stretches) if found else None,
-    )
+    return {
+        "stationary_s": float(sum(stretch.last_ns - stretch.first_ns for stretch in stretches)) * 1e-9,
+        "stationary": stretches,
+        "accel_at_rest_m_s2": float(np.average(norms, weights=[b - a for a, b in found])) if found else None,
+        "noise": _noise(imu, stretches) if found else None,
+    }
 
 
 def _noise(imu: ImuSamples, stretches: list[Interval]) -> ImuNoise:

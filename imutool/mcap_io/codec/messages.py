@@ -31,7 +31,7 @@ MESSAGE = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
-SINGLE_INDEX = struct.Struct("<BQHIQQ")  # a MessageIndex record with one entry
+MESSAGE_HEAD = SINGLE_INDEX = struct.Struct("<BQHIQQ")  # of a Message record; a MessageIndex record with one entry
 AT_ZERO = np.zeros(1, np.int64)
 FIXED = MESSAGE.itemsize - HEAD.size  # the part of a message's length that is not payload
 
@@ -265,12 +265,9 @@ def message_rows(
     return records
 
 
-_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
-
-
 def message_head(channel: int, sequence: int, log_time: int, publish_time: int, size: int) -> bytes:
     """The bytes of a Message record ahead of a payload of `size` bytes."""
-    return _MESSAGE_HEAD.pack(Opcode.MESSAGE, FIXED + size, channel, sequence, log_time, publish_time)
+    return MESSAGE_HEAD.pack(Opcode.MESSAGE, FIXED + size, channel, sequence, log_time, publish_time)
 
 
 def scatter(data: UInt8[np.ndarray, " b"], offsets: Int64[np.ndarray, " n"], rows: UInt8[np.ndarray, "n M"]) -> None:

@@ -177,11 +177,7 @@ def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
     Raises:
         LogError: no schema, or another encoding.
     """
-    return _numeric(log, topic, dict(log.firsts([topic])).get(topic), long=long)
-
-
-def _numeric(log: Log, topic: str, message: bytes | None, *, long: bool) -> list[str]:
-    decoder = decoder_of(log, log.topics[topic])
+    message, decoder = dict(log.firsts([topic])).get(topic), decoder_of(log, log.topics[topic])
     with log.named(topic):
         return [] if message is None else decoder.paths(message, long)
 

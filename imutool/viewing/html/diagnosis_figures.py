@@ -255,7 +255,8 @@ def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: d
         for row, (signal, part) in enumerate(compared.items()):
             for axis, axes in enumerate(panels[row]):
                 x = np.concatenate([variable(trace, signal, axis)[held_out_mask(trace)] for trace in d.traces])
-                blocks = np.concatenate([_blocks(trace, k)[held_out_mask(trace)] for k, trace in enumerate(d.traces)])
+                since_s = [(trace.t_s - trace.t_s[0])[held_out_mask(trace)] for trace in d.traces]
+                blocks = np.concatenate([np.floor(t_s / BLOCK_S) + 1e6 * k for k, t_s in enumerate(since_s)])
                 for values, color in sides:
                     y = np.concatenate(
                         [residual[held_out_mask(t), part][:, axis] for residual, t in zip(values, d.traces, strict=True)]
@@ -290,8 +291,3 @@ def means(x: Line, y: Line, blocks: Float64[np.ndarray, " n"]) -> tuple[Decimate
             rows.append((edges[k : k + 2].mean(), y[in_bin].mean(), 2.0 * np.linalg.norm(sums) / len(owner)))
     centre, mean, band = np.array(rows).reshape(-1, 3).T
     return centre, mean, band
-
-
-def _blocks(trace: Traces, log: int) -> Float64[np.ndarray, " n"]:
-    """Block number of each sample, different for each log."""
-    return np.asarray(np.floor((trace.t_s - trace.t_s[0]) / BLOCK_S) + 1e6 * log)

@@ -90,9 +90,9 @@ def _findings(d: Diagnosis) -> Iterator[str]:
     yield f'<div class="scroll"><table class="findings"><thead><tr>{head}</tr></thead><tbody>'
     for finding in d.findings:
         python = f"<pre>{text(finding.python)}</pre>" if finding.python else ""
+        similar = f"<br>could as well be {text(' or '.join(finding.similar))}" if finding.similar else ""
         cells = [
-            f"<strong>{text(label(finding))}</strong> {text(finding.signal)}"
-            f"<br>{text(effect_sentence(d, finding))}{_similar(finding)}",
+            f"<strong>{text(label(finding))}</strong> {text(finding.signal)}<br>{text(effect_sentence(d, finding))}{similar}",
             f"<code>{text(finding.equation)}</code>{python}{_entries(finding)}",
             _gain(finding),
             f"<span class=entry>{text(chance_text(finding.false_discovery_rate, short=True))}</span>",
@@ -108,10 +108,6 @@ def _gain(finding: Finding) -> str:
     width = 0 if math.isnan(finding.share) else round(BAR_PIXELS * min(max(finding.share, 0.0), 1.0))
     unseen = text(gain_text(finding.held_out).removesuffix(" of unseen data"))
     return f'{percent(finding.share)}<span class="bar" style="width: {width}px"></span><br>{unseen}'
-
-
-def _similar(finding: Finding) -> str:
-    return f"<br>could as well be {text(' or '.join(finding.similar))}" if finding.similar else ""
 
 
 def _entries(finding: Finding) -> str:

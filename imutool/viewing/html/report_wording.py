@@ -163,8 +163,9 @@ def key_numbers(data: RunData) -> list[tuple[str, str]]:
         numbers.append((format_quantity(float(trace.figures["aoe_deg"]), "°"), f"orientation error, {run_name(trace)}"))
         if trace.figures["ape_m"] is not None:
             numbers.append((format_quantity(float(trace.figures["ape_m"]), "m"), f"position error, {run_name(trace)}"))
-    if chosen is not None and (window := _window(chosen, 10.0)) is not None:
-        numbers.append((format_quantity(window, "°"), f"drift in 10 s, {run_name(chosen)}"))
+    drifts = {} if chosen is None else {window.length_s: window.orientation_deg for window in chosen.windows}
+    if chosen is not None and 10.0 in drifts:
+        numbers.append((format_quantity(drifts[10.0], "°"), f"drift in 10 s, {run_name(chosen)}"))
     if (count := sum(event.kind != "worst" for event in data.events)) > 0:
         numbers.append((f"{count:,}", "event" if count == 1 else "events"))
     return numbers
@@ -181,10 +182,6 @@ def index_of_best(values: Sequence[float | None], name: str) -> int | None:
     if name in NOT_ERRORS or len(known) < 2 or min(known)[0] == max(known)[0]:
         return None
     return min(known)[1]
-
-
-def _window(trace: Trace, length_s: float) -> float | None:
-    return next((window.orientation_deg for window in trace.windows if window.length_s == length_s), None)
 
 
 def _errors(trace: Trace) -> str:

@@ -159,11 +159,12 @@ class FlatBuffer:
         table = len(out)
         out += struct.pack("<i", table - vtable)
         places: dict[str, int] = {}
-        for field in sorted(fields, key=lambda field: -self._alignment(field)):
-            _align(out, self._alignment(field))
+        for field in sorted(fields, key=lambda field: -self._room(field)[0]):
+            alignment, size = self._room(field)
+            _align(out, alignment)
             places[field.name] = len(out)
             entries[(field.slot - 4) // 2] = len(out) - table
-            out += bytes(self._size(field))
+            out += bytes(size)
         struct.pack_into(f"<{2 + len(entries)}H", out, vtable, 4 + 2 * len(entries), len(out) - table, *entries)
         for field in fields:
             self._fill(out, places[field.name], field, tree.get(field.name))
@@ -199,15 +200,11 @@ class FlatBuffer:
         out += struct.pack("<I", count) + data
         return place
 
-    def _alignment(self, field: Field) -> int:
-        if field.base == OBJECT and self._objects[field.index].is_struct:
-            return self._objects[field.index].alignment
-        return struct.calcsize(SCALARS.get(field.base, "I"))
-
-    def _size(self, field: Field) -> int:
-        if field.base == OBJECT and self._objects[field.index].is_struct:
-            return self._objects[field.index].size
-        return struct.calcsize(SCALARS.get(field.base, "I"))
+    def _room(self, field: Field) -> tuple[int, int]:
+        """Alignment and size of a field in its table."""
+        if field.base == OBJECT and (kind := self._objects[field.index]).is_struct:
+            return kind.alignment, kind.size
+        return (struct.calcsize(SCALARS.get(field.base, "I")),) * 2
 
 
 def _object(table: _Table) -> Object:
