@@ -10,6 +10,7 @@ import re
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path, PurePosixPath
+from typing import IO
 
 from imutool.errors import ConfigError, DataError
 
@@ -130,26 +131,20 @@ class Tree:
                 raise DataError("is missing", where=self.where(name))
             check_size(self.where(name), name, self.sizes[name])
         if self.path.is_dir():
-            yield from self._each_in_folder(names)
+            yield from self._each_opened(names, lambda name: (self.path / ROOT / name).open("rb"))
         elif is_zip(self.path):
-            yield from self._each_in_zip(names)
+            with refusing(self.path), zipfile.ZipFile(self.path) as archive:
+                yield from self._each_opened(names, lambda name: archive.open(self._prefix + name))
         elif not is_packed(self.path):
             yield from self._each_in_plain_tar(names)
         else:
             yield from self._each_in_tar(names)
 
-    def _each_in_folder(self, names: Collection[str]) -> Iterator[tuple[str, bytes]]:
+    def _each_opened(self, names: Collection[str], open_file: Callable[[str], IO[bytes]]) -> Iterator[tuple[str, bytes]]:
         for name in names:
-            with refusing(self.where(name)), (self.path / ROOT / name).open("rb") as file:
+            with refusing(self.where(name)), open_file(name) as file:
                 content = read_bounded(file.read, self.where(name), name)
             yield name, content
-
-    def _each_in_zip(self, names: Collection[str]) -> Iterator[tuple[str, bytes]]:
-        with refusing(self.path), zipfile.ZipFile(self.path) as archive:
-            for name in names:
-                with refusing(self.where(name)), archive.open(self._prefix + name) as file:
-                    content = read_bounded(file.read, self.where(name), name)
-                yield name, content
 
     def _each_in_plain_tar(self, names: Collection[str]) -> Iterator[tuple[str, bytes]]:
         """Yield the files in the requested order.

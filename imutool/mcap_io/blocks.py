@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, ChunkIndex
+from mcap.records import AttachmentIndex, ChunkIndex, Metadata
 
 from imutool.array_types import Int64, UInt64
 from imutool.errors import LogError
@@ -35,6 +35,11 @@ class RecordSpan(NamedTuple):
     opcode: int
     offset: int
     length: int
+
+    def metadata(self, source: Source) -> Metadata:
+        """Content of a Metadata record (LogError: damaged)."""
+        found: Metadata = records.parse(Metadata, source.at(self.offset + HEAD.size, self.length - HEAD.size), self.offset)
+        return found
 
 
 @dataclass(slots=True)

@@ -188,20 +188,19 @@ class LogWriter:
         for known in self.contents.schemas.values():
             if (known.name, known.encoding, known.data) == (topic.schema_name, topic.schema_encoding, topic.schema):
                 return int(known.id)
-        number = free_id(self.contents.schemas, "schema")
-        record = Schema(id=number, name=topic.schema_name, encoding=topic.schema_encoding, data=topic.schema)
-        self.contents.schemas[number] = record
-        self._write_schema(record)
-        return number
+        return self._new_schema(topic.schema_name, topic.schema_encoding, topic.schema)
 
     def _schema(self, schema_name: str) -> int:
         """Id of a schema with the same definition (comments aside), or of a new one."""
-        text = schema.definition(schema_name)
+        text = schema.definition(schema_name).encode()
         for known in self.contents.schemas.values():
-            if known.name == schema_name and known.encoding == "ros2msg" and _bare(known.data) == _bare(text.encode()):
+            if known.name == schema_name and known.encoding == "ros2msg" and _bare(known.data) == _bare(text):
                 self._write_schema(known)  # once more: so far it may stand in a later chunk only
                 return int(known.id)
-        record = Schema(id=free_id(self.contents.schemas, "schema"), name=schema_name, encoding="ros2msg", data=text.encode())
+        return self._new_schema(schema_name, "ros2msg", text)
+
+    def _new_schema(self, name: str, encoding: str, data: bytes) -> int:
+        record = Schema(id=free_id(self.contents.schemas, "schema"), name=name, encoding=encoding, data=data)
         self.contents.schemas[record.id] = record
         self._write_schema(record)
         return record.id

@@ -9,7 +9,6 @@ from types import MappingProxyType, TracebackType
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Metadata
 
 from imutool.array_types import Int64, UInt64
 from imutool.errors import DataError, LogError
@@ -180,8 +179,7 @@ class Log:
         with self.named():
             for item in self.index.items:
                 if isinstance(item, RecordSpan) and item.opcode == Opcode.METADATA:
-                    body = self._source.at(item.offset + HEAD.size, item.length - HEAD.size)
-                    record = records.parse(Metadata, body, item.offset)
+                    record = item.metadata(self._source)
                     found.append((record.name, dict(record.metadata)))
         return found
 

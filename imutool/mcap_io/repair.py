@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 from mcap.opcode import Opcode
-from mcap.records import Metadata, MetadataIndex
+from mcap.records import MetadataIndex
 
 import imutool
 from imutool.errors import ConfigError, ImutoolError, LogError
@@ -237,8 +237,7 @@ class _Saver:
         if span.opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE_INDEX):
             return
         if span.opcode == Opcode.METADATA:
-            body = self.source.at(span.offset + HEAD.size, span.length - HEAD.size)
-            name = records.parse(Metadata, body, span.offset).name
+            name = span.metadata(self.source).name
             self.out.contents.metadata.append(MetadataIndex(offset=at, length=span.length, name=name))
         elif span.opcode == Opcode.ATTACHMENT:
             self.out.attachment(self.source, span.offset, span.length)

@@ -20,13 +20,12 @@ from itertools import islice
 from pathlib import Path
 
 from mcap.opcode import Opcode
-from mcap.records import Metadata, MetadataIndex
+from mcap.records import MetadataIndex
 
 from imutool.errors import ConfigError, LogError
 from imutool.file_location import Location, identity, same_location
 from imutool.mcap_io import Verified
 from imutool.mcap_io.blocks import Attachment, MessageBlock, MessageIndexes, RecordSpan, read_message_indexes
-from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.messages import Messages
 from imutool.mcap_io.codec.records import HEAD, ChunkHead
 from imutool.mcap_io.file_writer import Chunk, LogWriter
@@ -290,8 +289,7 @@ class _Rewrite:
             return
         at = span.offset + self.passing.defer(end)
         if span.opcode == Opcode.METADATA:
-            body = self.source.at(span.offset + HEAD.size, span.length - HEAD.size)
-            name = records.parse(Metadata, body, span.offset).name
+            name = span.metadata(self.source).name
             self.out.contents.metadata.append(MetadataIndex(offset=at, length=span.length, name=name))
         elif span.opcode == Opcode.ATTACHMENT:
             attachment = Attachment.of(self.source, span.offset, span.length - HEAD.size)
