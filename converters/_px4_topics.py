@@ -19,8 +19,10 @@ from imutool.geometry import quaternion
 from imutool.geometry.quaternion import FLU_FROM_FRD
 from imutool.recording import Imu, Poses, interpolate
 from imutool.recording.joined_imu import joined
-from imutool.recording.message_log import Remarks, Table
+from imutool.recording.message_log import MessageLog, Remarks, Table
 from imutool.recording.sample_order import in_order
+
+from . import Sequence
 
 MIN_IMU_HZ = 10.0  # slower logs of a sensor are samples for its temperature, not for its motion
 UP_FROM_DOWN = np.array([1.0, 1.0, -1.0])
@@ -147,7 +149,24 @@ def _poses(topics: dict[str, Columns], ending: str, remarks: Remarks) -> Poses |
     return Poses(t_ns, p_wb, quaternion.unit(quaternion.enu_from_ned(q_ned_frd)), v_w)
 
 
-def table_of(name: str, columns: Columns, start_ns: int) -> Table:
+def log_of(
+    sequence: Sequence, format: str, topics: dict[str, Columns], poses: dict[str, Poses], start_ns: int, remarks: Remarks
+) -> MessageLog:
+    """Message log of topics and their poses."""
+    frames = "IMU and poses: FLU body in ENU; px4_msgs topics: FRD in NED"
+    return MessageLog(
+        sequence.name,
+        sequence.path.name,
+        imus=imus_of(topics, remarks),
+        poses=poses,
+        tables={f"/{name}": _table(name, columns, start_ns) for name, columns in topics.items()},
+        kinds={topic: "truth" if topic.startswith("/ground_truth") else "estimate" for topic in poses},
+        metadata={"imutool": {"format": format, "sequence": sequence.name, "frames": frames}},
+        remarks=remarks,
+    )
+
+
+def _table(name: str, columns: Columns, start_ns: int) -> Table:
     """Columns of a PX4 topic as a message; `q[0]`, `q[1]`, ... are one field."""
     groups: dict[str, list[str]] = {}
     for column in columns:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from imutool.errors import DataError
 from imutool.recording.message_log import Attachment, Message, MessageLog, MessageTopic, Remarks
@@ -165,24 +165,17 @@ def is_finished(path: Path) -> bool:
     if head(path, len(MAGIC)) != MAGIC:
         return False
     with path.open("rb") as file:
-        return _ends_whole(file)
+        file.seek(-len(MAGIC), 2)
+        return file.read() == MAGIC
 
 
 def _summary(path: Path) -> Any:
     """Summary of a finished log; None of any other."""
     try:
         with _refusing(path), path.open("rb") as file:
-            return _reader(file).get_summary() if _ends_whole(file) else None
+            return _reader(file).get_summary() if is_finished(path) else None
     except DataError:  # said again when the log is read
         return None
-
-
-def _ends_whole(file: BinaryIO) -> bool:
-    """Whether a log ends as its writer ends one."""
-    file.seek(-len(MAGIC), 2)
-    end = file.read()
-    file.seek(0)
-    return end == MAGIC
 
 
 def read_parts(sequence: Sequence, paths: list[Path], remarks: Remarks, *, images: bool, define: Define) -> MessageLog:

@@ -12,7 +12,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import MessageLog, Remarks
 
 from . import Sequence
-from ._px4_topics import Columns, imus_of, poses_of, table_of
+from ._px4_topics import Columns, log_of, poses_of
 from ._source import find_folders, head
 from ._tables.text.numbers import plain_columns
 
@@ -68,18 +68,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     if not topics:
         raise DataError("holds no data", where=sequence.path, expected="tables with rows")
     first_us = min(int(stamps[stamps > 0].min(initial=2**62)) for stamps in (each["timestamp"] for each in topics.values()))
-    poses = poses_of(topics, remarks)
-    frames = "IMU and poses: FLU body in ENU; px4_msgs topics: FRD in NED"
-    return MessageLog(
-        sequence.name,
-        sequence.path.name,
-        imus=imus_of(topics, remarks),
-        poses=poses,
-        tables={f"/{name}": table_of(name, columns, 1000 * first_us) for name, columns in topics.items()},
-        kinds={topic: "truth" if topic.startswith("/ground_truth") else "estimate" for topic in poses},
-        metadata={"imutool": {"format": "px4_csv", "sequence": sequence.name, "frames": frames}},
-        remarks=remarks,
-    )
+    return log_of(sequence, "px4_csv", topics, poses_of(topics, remarks), 1000 * first_us, remarks)
 
 
 def read(source: Path) -> Iterator[MessageLog]:

@@ -11,6 +11,7 @@ import logging
 import struct
 from collections.abc import Iterator
 from contextlib import redirect_stdout
+from dataclasses import replace
 from functools import partial
 from io import BufferedReader, FileIO, StringIO
 from mmap import ACCESS_READ, mmap
@@ -22,7 +23,7 @@ from imutool.errors import DataError, required
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._px4_topics import Columns, imus_of, poses_of, table_of
+from ._px4_topics import Columns, log_of, poses_of
 from ._source import find_files, head
 
 GENERAL = True
@@ -74,18 +75,9 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     texts = [(m.timestamp * 1000, m.log_level_str(), m.message) for m in ulog.logged_messages if m.timestamp < LATEST_US]
     if len(texts) < len(ulog.logged_messages):
         remarks.losses.append(f"texts with an impossible time: {len(ulog.logged_messages) - len(texts)}")
-    return MessageLog(
-        sequence.name,
-        sequence.path.name,
-        topics=(TEXTS,) if texts else (),
-        messages=partial(_logged, texts),
-        imus=imus_of(topics, remarks),
-        poses=poses,
-        tables={f"/{name}": table_of(name, columns, start_ns) for name, columns in topics.items()},
-        kinds={topic: "truth" if topic.startswith("/ground_truth") else "estimate" for topic in poses},
-        metadata=_metadata(sequence, ulog),
-        remarks=remarks,
-    )
+    log = log_of(sequence, "ulog", topics, poses, start_ns, remarks)
+    messages, metadata = partial(_logged, texts), {**log.metadata, **_metadata(ulog)}
+    return replace(log, topics=(TEXTS,) if texts else (), messages=messages, metadata=metadata)
 
 
 def read(source: Path) -> Iterator[MessageLog]:
@@ -130,10 +122,8 @@ def _is_cut(path: Path) -> bool:
         return position != len(raw)
 
 
-def _metadata(sequence: Sequence, ulog: Any) -> dict[str, dict[str, str]]:
-    own = {"format": "ulog", "sequence": sequence.name, "frames": "IMU and poses: FLU body in ENU; px4_msgs topics: FRD in NED"}
+def _metadata(ulog: Any) -> dict[str, dict[str, str]]:
     return {
-        "imutool": own,
         "px4/info": {name: str(value) for name, value in ulog.msg_info_dict.items()},
         "px4/parameters": {name: str(value) for name, value in ulog.initial_parameters.items()},
         "px4/changed_parameters": {f"{t} us {name}": str(value) for t, name, value in ulog.changed_parameters},

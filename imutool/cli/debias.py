@@ -62,10 +62,7 @@ def debias(
     unused = save_view is None and report_to is None and common.json_to is None
     _refuse_contradictions(target, in_place, common.overwrite and unused)
     models = assigned(model or ())
-    if report_to is not None:  # refused before the work
-        from imutool.viewing.html.drawing import require_matplotlib
-
-        require_matplotlib()
+    _require_matplotlib(report_to)
     from imutool.cleaning import CleaningSettings
     from imutool.debiasing import debias as run
 
@@ -97,6 +94,14 @@ def debias(
             say(f"Report: {report_to}")
     unsaved = save_view is not None and watch is not None and all(output.how != "rrd" for output in watch.shown)
     raise typer.Exit(LOST if report.lossy or unsaved else 0)
+
+
+def _require_matplotlib(report_to: Path | None) -> None:
+    """Refuse a report without matplotlib before the work."""
+    if report_to is not None:
+        from imutool.viewing.html.drawing import require_matplotlib
+
+        require_matplotlib()
 
 
 class StretchEntry(Section, frozen=True):

@@ -47,8 +47,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
     """
     imus: dict[str, Float64[np.ndarray, "2 3 3"]] = {}
     notes: dict[str, list[str]] = defaultdict(list)
-    world, frame_id, late_ns, body, pose_topic, unit, quaternions = np.eye(3), "", 0, NOT_TURNED, "", "m", ""
-    copies, kept, before = frozenset[str](), list[str](), list[str]()
+    poses, kept, before = Corrections(), list[str](), list[str]()
     with Log(path) as log:
         stamps = find_stamps(log, notes) if STAMPS in wanted else {}
         for topic in log.imu_topics if CONVENTIONS in wanted else []:
@@ -58,13 +57,13 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             survey = look(log, topic, CleaningSettings(fix=True))
             kept += [f"{topic}: {step}" for step in survey.clock_steps]
             kept += [f"{topic}: {f.distrust}, which stays" for f in survey.findings if f.rule == "units" and f.distrust]
-            mount = None if frame_id or (survey.mount == np.eye(3)).all() else survey.mount
-            if frame_id:  # the next round judges by the corrected poses
+            mount = None if poses.frame_id or (survey.mount == np.eye(3)).all() else survey.mount
+            if poses.frame_id:  # the next round judges by the corrected poses
                 survey = replace(survey, axes=AS_RECORDED)
             elif mount is not None and any(is_straight(log, ImuSamples(log, each), survey.pose_topic) for each in before):
                 survey, mount = replace(survey, axes=np.stack([mount] * 2)), None
             before.append(topic)
-            hidden = frame_id or survey.pose_delay_ns or survey.quaternions or (survey.matrices != np.eye(3)).any()
+            hidden = poses.frame_id or survey.pose_delay_ns or survey.quaternions or (survey.matrices != np.eye(3)).any()
             if survey.pose_topic and mount is None and not hidden:
                 survey = replace(survey, axes=np.stack([_gyro_axes(log, topic, survey.pose_topic), np.eye(3)]))
             patched = described.reflected is None or isinstance(described.reflected, Reflected)
@@ -77,7 +76,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 imus[topic] = survey.matrices
                 others = "; other fields of its messages stay" if isinstance(described.reflected, Reflected) else ""
                 notes[topic].append(_imu_note(survey) + others)
-            if frame_id or not survey.pose_topic:
+            if poses.frame_id or not survey.pose_topic:
                 continue
             comes_later = topic in imus or survey.pose_delay_ns or survey.quaternions  # all of it hides a body's rotation
             turned: Body | None = None if mount is None else body_of(log, survey.pose_topic, mount.T)
@@ -87,14 +86,24 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             if changes and (poses_of := log.topics[survey.pose_topic]).reflected is not None:
                 kept.append(f"{poses_of.name} keeps its poses: only those of ROS are corrected, not {poses_of.own_schema}")
             elif changes:
-                world, late_ns, body, pose_topic = survey.world, survey.pose_delay_ns, turned or NOT_TURNED, survey.pose_topic
-                unit, quaternions, copies = survey.position_unit, survey.quaternions, frames_of_copies(log, pose_topic)
-                frame_id = next(log.pose_batches(pose_topic)).frame_id
-                notes[pose_topic] += changes
+                poses = _of_poses(log, survey, turned)
+                notes[survey.pose_topic] += changes
         own_types = {t: found for t in (*stamps, *imus) if isinstance(found := log.topics[t].reflected, Reflected)}
     texts = {topic: "; ".join(lines) for topic, lines in notes.items()}
-    poses = world, frame_id, late_ns, body, pose_topic, unit, quaternions, copies
-    return Corrections(imus, *poses, stamps, own_types, texts, kept)
+    return replace(poses, imus=imus, stamps=stamps, reflected=own_types, notes=texts, kept=kept)
+
+
+def _of_poses(log: Log, survey: Survey, turned: Body | None) -> Corrections:
+    return Corrections(
+        world=survey.world,
+        frame_id=next(log.pose_batches(survey.pose_topic)).frame_id,
+        late_ns=survey.pose_delay_ns,
+        body=turned or NOT_TURNED,
+        pose_topic=survey.pose_topic,
+        unit=survey.position_unit,
+        quaternions=survey.quaternions,
+        copies=frames_of_copies(log, survey.pose_topic),
+    )
 
 
 def _gyro_axes(log: Log, topic: str, pose_topic: str) -> Float64[np.ndarray, "3 3"]:

@@ -80,11 +80,7 @@ class MessageBlock:
         return known is None or not known.keys().isdisjoint(channels)  # looks up the fewer of the two
 
     def head(self, raw: bytes | memoryview) -> ChunkHead:
-        """The head of the chunk, from the first `HEAD_BYTES` of its bytes or more.
-
-        Raises:
-            LogError: there is no chunk where the block says, or its lengths contradict one another.
-        """
+        """The chunk's head, from its first `HEAD_BYTES` bytes or more (LogError: no chunk, or lengths that contradict)."""
         if HEAD.unpack_from(raw) != (CHUNK, self.length - HEAD.size):
             raise LogError(f"the summary lists a chunk at byte {self.offset}, and none begins there")
         return ChunkHead.of(raw, self.length, self.offset)

@@ -82,7 +82,7 @@ def repair_head(raw: bytes, offset: int, known: ChunkIndex | None, max_chunk: in
         return None
     for candidate in _candidates(raw, known):
         try:
-            head = records.ChunkHead.of(candidate[:128], len(candidate), offset)
+            head = records.ChunkHead.of(candidate[:HEAD_BYTES], len(candidate), offset)
             if head.crc:
                 records.unpack(candidate, offset, max_chunk)
                 if _is_one_frame(candidate[head.data_at :]):
@@ -107,7 +107,7 @@ def is_consistent(raw: bytes, offset: int, known: ChunkIndex | None) -> bool:
     if len(raw) < HEAD.size or HEAD.unpack_from(raw) != (Opcode.CHUNK, len(raw) - HEAD.size):
         return False
     try:
-        head = records.ChunkHead.of(raw[:128], len(raw), offset)
+        head = records.ChunkHead.of(raw[:HEAD_BYTES], len(raw), offset)
     except LogError:
         return False
     if known is not None:
@@ -120,12 +120,9 @@ def _size(packed: bytes, compression: str, stated: int) -> int:
     """Size of the contents from the packed bytes, or as the head states it."""
     if compression == "":
         return len(packed)
-    if compression == "zstd":
-        try:
-            size = zstandard.frame_content_size(packed)
-        except zstandard.ZstdError:
-            return stated
-        return stated if size < 0 else int(size)
+    with contextlib.suppress(zstandard.ZstdError):
+        if compression == "zstd" and (size := zstandard.frame_content_size(packed)) >= 0:
+            return int(size)
     return stated
 
 
