@@ -7,7 +7,7 @@ stamps that go back, repeated stamps, and values that are not finite.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -181,21 +181,31 @@ def _imu(
         **imu.recorded.clock()._asdict(),
         **imu.counts,
         saturation_rule=saturation.RULE,
-        **rest,
+        stationary_s=rest.seconds,
+        stationary=rest.stretches,
+        accel_at_rest_m_s2=rest.accel_m_s2,
+        noise=rest.noise,
     ), {} if misread else {name: turns.agreement() for name, turns in motion.turns.items()}
 
 
-def _rest(imu: ImuSamples, blocks: Blocks) -> dict[str, Any]:
-    """Entries of a report: stationary stretches, the specific force there, and the noise."""
+class _Rest(NamedTuple):
+    seconds: float
+    stretches: list[Interval]
+    accel_m_s2: float | None
+    noise: ImuNoise | None
+
+
+def _rest(imu: ImuSamples, blocks: Blocks) -> _Rest:
+    """Stationary stretches, the specific force there, and the noise."""
     found = resting_blocks(blocks)
     stretches = [Interval(int(blocks.first_ns[a]), int(blocks.last_ns[b - 1])) for a, b in found]
     norms = [float(np.linalg.norm(blocks.mean[a:b, 3:].mean(axis=0))) for a, b in found]
-    return {
-        "stationary_s": float(sum(stretch.last_ns - stretch.first_ns for stretch in stretches)) * 1e-9,
-        "stationary": stretches,
-        "accel_at_rest_m_s2": float(np.average(norms, weights=[b - a for a, b in found])) if found else None,
-        "noise": _noise(imu, stretches) if found else None,
-    }
+    return _Rest(
+        seconds=float(sum(stretch.last_ns - stretch.first_ns for stretch in stretches)) * 1e-9,
+        stretches=stretches,
+        accel_m_s2=float(np.average(norms, weights=[b - a for a, b in found])) if found else None,
+        noise=_noise(imu, stretches) if found else None,
+    )
 
 
 def _noise(imu: ImuSamples, stretches: list[Interval]) -> ImuNoise:
