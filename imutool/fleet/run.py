@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from imutool.errors import LOST, ConfigError
+from imutool.errors import LOST, ConfigError, ImutoolError
 from imutool.file_location import Location, exists, to_location
 from imutool.fleet import page as pages
 from imutool.fleet import results
@@ -91,7 +91,7 @@ class FleetReport:
     seconds: float
     not_whole: tuple[Result, ...]
     comparison: Comparison | None
-    page_error: ConfigError | None = None
+    page_error: ImutoolError | None = None
 
     def summary(self) -> FleetSummary:
         """Summary in JSON."""
