@@ -155,7 +155,7 @@ def between_rows(
     share: Column,
     t_s: Float64[np.ndarray, " m"] | None = None,
 ) -> Quaternions:
-    """Unit quaternions between rows, by slerp in blocks, or along a curve where the times of the rows are given.
+    """Unit quaternions between rows, by slerp, or with the times of the rows along a curve.
 
     From the row before `after` (share 0) to the row `after` (share 1). The curve is the cubic of the rotation vector whose
     rates at both ends are those of parabolas through three rows: slerp over h makes turns of frequency f too small by the share

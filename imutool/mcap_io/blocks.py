@@ -61,11 +61,7 @@ class MessageBlock:
 
     @staticmethod
     def of_summary(entry: ChunkIndex, limit: int) -> MessageBlock:
-        """A chunk as the summary describes it.
-
-        Raises:
-            LogError: it would cross the byte `limit`.
-        """
+        """A chunk as the summary describes it; a LogError if it would cross the byte `limit`."""
         offset, length = entry.chunk_start_offset, entry.chunk_length
         end = offset + length + entry.message_index_length
         if length < HEAD.size + CHUNK_HEAD.size or end > limit:
