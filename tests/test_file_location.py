@@ -493,7 +493,7 @@ def test_a_debias_that_is_terminated_in_the_middle_of_its_upload_leaves_nothing(
         assert len(store.uploads()) == 1
         process.send_signal(signal.SIGTERM)
         _, stderr = process.communicate(timeout=60)
-    assert (process.returncode, stderr) == (143, b"")
+    assert (process.returncode, stderr) == (143, b"error: ended by SIGTERM. Nothing half-written is left.\n")
     assert (store.uploads(), store.keys()) == ([], ["in.mcap"])
 
 

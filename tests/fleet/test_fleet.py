@@ -389,7 +389,9 @@ def test_a_fleet_that_is_ended_goes_on_where_it_was(
     out = tmp_path / "out"
     words = ["fleet", "debias", str(many), str(out), "--model", str(logs / "linear.safetensors"), "--workers", "1"]
     line = [command, *words, "--memory-per-task", "300M"]
+    nohup = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under it
     running = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    signal.signal(signal.SIGHUP, nohup)
     soon(lambda: len(list(out.glob("*.mcap"))) >= 2)
     family, began = below(running.pid), time.monotonic()
     assert len(family) == 2

@@ -98,6 +98,7 @@ def test_a_histogram_of_what_cannot_be_negative_ends_at_zero(monkeypatch: pytest
 
     figure = Figure()
     monkeypatch.setattr(page, "svg", lambda draw, height, name: draw(figure))
+    monkeypatch.setattr(page, "AFTER", "red")  # `svg` puts in the colour
     page._histograms([([0.1, 40.0, 60.0], "seconds a log"), ([50.0, 55.0, 60.0], "MB/s of one worker")], "times")
     near, far = (axes.get_xlim()[0] for axes in figure.axes)
     assert near == 0.0

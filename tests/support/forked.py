@@ -68,6 +68,7 @@ def _run(words: list[str], cwd: Path, stderr: str, before: Callable[[], None] | 
     for place, file in enumerate((nothing, nothing, os.open(stderr, os.O_WRONLY))):
         os.dup2(file, place)
     sys.stdin, sys.argv = open(0, closefd=False), ["imutool", *words]  # noqa: SIM115
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under nohup
     if before is not None:
         before()
     try:

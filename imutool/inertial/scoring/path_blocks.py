@@ -78,7 +78,7 @@ class TrueSpan:
     def _at(self, t_ns: Times) -> tuple[Poses, Mask]:
         known = self._truth.t_ns
         first, last = np.searchsorted(known, t_ns[[0, -1]])
-        around = slice(max(0, min(int(first) - 1, len(known) - 2)), max(2, int(last) + 1))
+        around = slice(max(0, min(int(first), len(known) - 1) - 2), max(2, int(last) + 2))  # rates of a curve need one more
         return self._truth.rows(around).at(t_ns, self._gap_s)
 
 
