@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from imutool.converters import table
+from imutool.converters._tables.files.json_documents import load_json
+from imutool.converters._tables.text.delimited import Columns
 from imutool.errors import ConfigError, DataError
 from imutool.recording.message_log import MessageLog
 
@@ -233,3 +235,13 @@ def test_signals_of_a_bus_have_their_own_times(tmp_path, late):
     np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL[:count])
     (speed,) = (scalars for topic, scalars in log.scalars.items() if "speed" in topic)
     assert np.array_equal(speed.t_ns, 1000 * (t_us + 777))
+
+
+@pytest.mark.parametrize(("unit", "more"), [({"per": "s"}, []), (7, []), ("rad/s", [0.5])])
+def test_what_only_looks_like_a_signal_keeps_all_its_columns(tmp_path, unit, more):
+    """A unit that is no text, and rows of more than a time and a value."""
+    document = {"angular_velocity_x": {"unit": unit, "values": [[0.01 * n, 0.1, *more] for n in range(COUNT)]}}
+    (tmp_path / "a.json").write_text(json.dumps(document))
+    columns = Columns()
+    load_json(tmp_path / "a.json", columns)
+    assert sum(name.startswith("angular_velocity_x") for name in columns.values) == 2 + len(more)

@@ -86,9 +86,7 @@ def _without_signals(document: Any, columns: Columns) -> Any:
     Such is `{"ax": {"unit": "g", "values": [[0, 0.1], ...]}}`. Signals of the same times are a group.
     """
     named = document.items() if isinstance(document, dict) else ()
-    found = {
-        name: node for name, node in named if isinstance(node, dict) and node.keys() == SIGNAL and _is_matrix(node["values"])
-    }
+    found = {name: node for name, node in named if _is_signal(node)}
     groups: dict[bytes, Columns] = {}
     for name, node in found.items():
         times, values = (_numbers([row[place] for row in node["values"]]) for place in (0, 1))
@@ -98,6 +96,13 @@ def _without_signals(document: Any, columns: Columns) -> Any:
     for group in groups.values():
         columns.take([*group.values][1], group, ", ".join([*group.values][1:]))
     return {name: node for name, node in document.items() if name not in found} if found else document
+
+
+def _is_signal(node: Any) -> bool:
+    """Whether a node has a unit, and a time and a value in each row."""
+    if not isinstance(node, dict) or node.keys() != SIGNAL or not isinstance(node["unit"], str | None):
+        return False
+    return _is_matrix(node["values"]) and len(node["values"][0]) == 2
 
 
 def _decoded(path: Path, columns: Columns) -> Any:

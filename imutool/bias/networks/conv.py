@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +24,15 @@ MOMENTUM = 0.1  # of the running mean: batch norm's usual value
 MIN_SCALE = (1e-2, 1e-2, 1e-2, 1e-1, 1e-1, 1e-1)  # rad/s, m/s²: limits the gain of a channel without motion
 
 
-Folded = tuple[Float[Tensor, "after before kernel"], Float[Tensor, " after"], int]  # as `imutool.bias.conv.FoldedLayer`
+class FoldedLayer(NamedTuple):
+    """Layer with folded batch norm, for deviations from rest.
+
+    y = GELU(weight * x + offset) - GELU(offset).
+    """
+
+    weight: Float[Tensor, "after before kernel"]
+    offset: Float[Tensor, " after"]
+    dilation: int
 
 
 class Layer(nn.Module):
@@ -51,11 +59,11 @@ class Layer(nn.Module):
             self.var.copy_(var)
         return functional.dropout(functional.gelu(y), self.dropout, self.training)
 
-    def folded(self, x: Float[Tensor, " before"]) -> Folded:
+    def folded(self, x: Float[Tensor, " before"]) -> FoldedLayer:
         """Folded layer for deviations from the constant input `x`."""
         gain = self.gain * (self.var + EPSILON).rsqrt()
         weight = self.weight * gain[:, None, None]
-        return weight, weight.sum(2) @ x + self.shift - self.mean * gain, self.dilation
+        return FoldedLayer(weight, weight.sum(2) @ x + self.shift - self.mean * gain, self.dilation)
 
 
 class Net(nn.Module):
@@ -92,16 +100,16 @@ class Net(nn.Module):
 
     def at_rest(self) -> Float[Tensor, "3"]:
         """N(0): output for zero rate and zero force for all time."""
-        level: Tensor = self.unit * (self.out @ functional.gelu(self.folded()[-1][1]))
+        level: Tensor = self.unit * (self.out @ functional.gelu(self.folded()[-1].offset))
         return level
 
-    def folded(self) -> list[Folded]:
+    def folded(self) -> list[FoldedLayer]:
         """Folded layers; the input of the first is u / scale, the deviation from zero motion."""
         x, layers = -self.centre / self.scale, []
         for layer in self.layers:
             assert isinstance(layer, Layer)
             layers.append(layer.folded(x))
-            x = functional.gelu(layers[-1][1])
+            x = functional.gelu(layers[-1].offset)
         return layers
 
 

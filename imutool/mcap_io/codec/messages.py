@@ -31,7 +31,8 @@ MESSAGE = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
-MESSAGE_HEAD = SINGLE_INDEX = struct.Struct("<BQHIQQ")  # of a Message record; a MessageIndex record with one entry
+MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # of a Message record, up to its payload
+SINGLE_INDEX = struct.Struct("<BQHIQQ")  # a MessageIndex record with one entry
 AT_ZERO = np.zeros(1, np.int64)
 FIXED = MESSAGE.itemsize - HEAD.size  # the part of a message's length that is not payload
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -73,9 +73,7 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
     topic, derived, messages, biases_by_topic, rest, metadata = contents
     where = f"{path} {topic}"
     true = truth_of(rest)
-    firsts = range(0, len(messages[topic].stamp_ns), BLOCK)
-    blocks = partial(map, lambda first: rows_of(messages[topic], slice(first, first + BLOCK)), firsts)
-    survey = examine(blocks, true, CleaningSettings(), where=str(path), topic=topic)
+    survey = examine(partial(_blocks, messages[topic]), true, CleaningSettings(), where=str(path), topic=topic)
     samples, logged, why = _sound_samples(messages[topic], survey, where)
     if why:
         text = f"{survey.messages - survey.valid} of {survey.messages} messages are left out"
@@ -153,6 +151,11 @@ def _whole(batches: list[ImuBatch]) -> ImuBatch:
     for column in columns:  # so that the samples need no copy
         column.flags.writeable = False
     return ImuBatch._make([*columns, frame_id])
+
+
+def _blocks(messages: ImuBatch) -> Iterator[ImuBatch]:
+    for first in range(0, len(messages.stamp_ns), BLOCK):
+        yield rows_of(messages, slice(first, first + BLOCK))
 
 
 def _sound_samples(messages: ImuBatch, survey: Survey, where: str) -> tuple[Imu, LogTimes, str]:
