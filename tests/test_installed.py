@@ -56,7 +56,12 @@ def test_help_imports_nothing_heavy(imported: Callable[..., set[str]], words: li
     assert imported(*words) == set()
 
 
-@pytest.mark.parametrize("line", ["info LOG", "clean LOG", "evaluate LOG --model MODEL", "debias LOG o.mcap --model MODEL"])
+HYBRID = "debias LOG o.mcap --model euroc-adis16448-hybrid --force --init truth"
+
+
+@pytest.mark.parametrize(
+    "line", ["info LOG", "clean LOG", "evaluate LOG --model MODEL", "debias LOG o.mcap --model MODEL", HYBRID]
+)
 def test_commands_that_look_or_infer_import_nothing_heavy(imported: Callable[..., set[str]], logs: Path, line: str) -> None:
     given = {"LOG": logs / "flight_1.mcap", "MODEL": logs / "linear.safetensors"}
     assert imported(*(given.get(word, word) for word in line.split())) == set()

@@ -31,7 +31,7 @@ from imutool.mcap_io.codec.records import HEAD, ChunkHead
 from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.added_topics import DerivedStream, DerivedTopics, check_new_topics, define
-from imutool.mcap_io.passthrough.chunk_check import check_chunk, parts_of
+from imutool.mcap_io.passthrough.chunk_check import ChunkReader, parts_of
 from imutool.mcap_io.storage.target import PassThrough
 from imutool.mcap_io.verify import check_data_crc, check_mode, stated_crc, verify
 from imutool.mcap_io.write import CHUNK_BYTES
@@ -133,6 +133,9 @@ class _Rewrite:
         self.streams = [self._stream(topics, own) for topics in derived]
         self.imu_channels = set().union(*(stream.sources for stream in self.streams)) if self.streams else set()
         self.passing = PassThrough(self.source, out.target)
+        coming = (item for item in self.index.items if isinstance(item, MessageBlock) and self._must_unpack(item))
+        kept = log.kept or ()  # most of these need not be read again
+        self.reader = ChunkReader(self.source, (block for block in coming if block not in kept), self.index.max_chunk)
         self.checked = self.unchecked = 0  # chunks unpacked before or while copying; messages that no CRC covers
         self.new_chunks = set[int]()  # their offsets
 
@@ -148,7 +151,7 @@ class _Rewrite:
             LogError: the source is damaged, or the copy is.
         """
         size = self.source.size
-        with self.log.named():
+        with self.log.named(), self.reader:
             self._copy_all(size)
         contents = self.out.contents
         verified = self._verified()
@@ -211,12 +214,17 @@ class _Rewrite:
             self.checked += 1
             self._list_chunk(block, kept.head, kept.indexes, self.passing.defer(block.end))
             return
-        if self.index.definitions_known and block.indexes and self.imu_channels.isdisjoint(block.indexes):
+        if not self._must_unpack(block):
             head, indexes = read_message_indexes(self.source, block)
             if indexes is not None and head[:2] == (indexes.start_ns, indexes.end_ns):
                 self._list_chunk(block, head, indexes, self.passing.defer(block.end))
                 return
         self._copy_unpacked(block)
+
+    def _must_unpack(self, block: MessageBlock) -> bool:
+        """Whether a chunk may hold messages of an IMU, or definitions."""
+        known = self.index.definitions_known and block.indexes and self.imu_channels.isdisjoint(block.indexes)
+        return block.compression is not None and not known
 
     def _wrap_run(self, block: MessageBlock) -> None:
         """Writes messages outside chunks as a chunk."""
@@ -231,9 +239,8 @@ class _Rewrite:
 
     def _copy_unpacked(self, block: MessageBlock) -> None:
         """Copies a chunk that must be unpacked; wrong message indexes are replaced."""
-        everything = memoryview(self.source.at(block.offset, block.end - block.offset))
         try:
-            head, indexes, right, found = check_chunk(everything, block, self.index.max_chunk)
+            everything, (head, indexes, right, found) = self.reader.read(block)
         except LogError as error:
             self.index.lose(block, error)
             self.passing.flush()

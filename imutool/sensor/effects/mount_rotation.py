@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import lru_cache, partial
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64, Vectors
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, residual
@@ -33,11 +32,17 @@ def _turned(x: Vectors, R_bi: Float64[np.ndarray, "3 3"]) -> Vectors:
 
 @lru_cache(maxsize=64)
 def _rotation(*phi: float) -> Float64[np.ndarray, "3 3"]:
+    from scipy.spatial.transform import (
+        Rotation,  # a tenth of a second and more, which a model that has this effect need not wait
+    )
+
     return np.asarray(Rotation.from_rotvec(phi).as_matrix())
 
 
 def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     """No rotation; also the nearest of both sensors (Kabsch, Acta Cryst. 1976), if it is large and takes most of the misfit."""
+    from scipy.spatial.transform import Rotation
+
     read = motion.sample(samples.stamp_s, samples.stamp_s)
     pairs = [(read.gyro - read.gyro.mean(axis=0), samples.gyro - samples.gyro.mean(axis=0)), (read.accel, samples.accel)]
     body, sensor = (np.concatenate([pair[k] / max(pair[0].std(), NOTHING_MOVES) for pair in pairs]) for k in (0, 1))
