@@ -131,8 +131,9 @@ def evaluate(
     if not common.write(Evaluation(convert(results, list[Score]))):
         rows = [{**row, "model": f"{row['model']} aided"} if row["estimate"] == "aided" else row for row in results]
         figures(rows, aligned=aligned)
-        for sentence in [*_used(results), *_late(results), *_fits(results), *([] if report is None else [f"Report: {report}"])]:
+        for sentence in [*_used(results), *_late(results), *([] if report is None else [f"Report: {report}"])]:
             say(sentence)
+    _warn_of_fits(results)
     raise_kept([*errors, *_unfit(results)])
 
 
@@ -153,10 +154,11 @@ def _refuse_one_name(logs: Sequence[Path]) -> None:
             known[name] = path
 
 
-def _fits(results: Sequence[dict[str, Any]]) -> list[str]:
-    """Sentences about the models that may not fit a log."""
-    rows = [row for row in results if row["estimate"] == "integration" and row["fit"] and row["fit"]["verdict"] != "fits"]
-    return [f"{row['log']}: {convert(row['fit'], Fitness).sentence(row['model'])}" for row in rows]
+def _warn_of_fits(results: Sequence[dict[str, Any]]) -> None:
+    """Warn of the models that may not fit a log, as a view of it does."""
+    for row in results:
+        if row["estimate"] == "integration" and row["fit"]:
+            convert(row["fit"], Fitness).report(row["model"], row["log"], force=True)
 
 
 def _unfit(results: Sequence[dict[str, Any]]) -> list[ImutoolError]:

@@ -184,22 +184,26 @@ def raise_kept(errors: Sequence[ImutoolError]) -> None:
 
 
 class _Lines(logging.Handler):
-    """Handler that prints log records on stderr, above the progress bar; what logs in a row have alike in one line more."""
+    """Handler that prints log records on stderr, a warning once; what logs in a row have alike in one line more."""
 
     def __init__(self) -> None:
         super().__init__()
         self._level, self._text, self._logs = "", "", list[str]()
+        self._warnings = set[str]()
 
     def emit(self, record: logging.LogRecord) -> None:
-        log, colon, text = record.getMessage().partition(": ")
-        level = record.levelname.lower()
+        message, level = record.getMessage(), record.levelname.lower()
+        if record.levelno >= logging.WARNING:
+            if message in self._warnings:  # a command may read a log twice
+                return
+            self._warnings.add(message)
+        log, colon, text = message.partition(": ")
         if colon and (level, text) == (self._level, self._text):
-            if log not in self._logs:  # a command may read a log twice
-                self._logs.append(log)
+            self._logs.append(log)
             return
         self.flush()
         self._level, self._text, self._logs = level, text, [log]
-        say(with_flags(f"{level}: {record.getMessage()}"), to=err)
+        say(with_flags(f"{level}: {message}"), to=err)
 
     def flush(self) -> None:
         """Name the other logs of the last text."""
