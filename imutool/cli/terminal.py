@@ -77,7 +77,10 @@ def tell_error(message: str) -> None:
 
 def tell_end(how: str, end: BaseException) -> None:
     """Print how a command ended too early; notes of the exception say how to go on."""
-    tell_error(f"{how}. {with_flags(' '.join(getattr(end, '__notes__', ()))) or 'Nothing half-written is left'}.")
+    is_second = end.__cause__ is None and isinstance(end.__context__, KeyboardInterrupt | SystemExit)  # ended the clean-up
+    left = "A file of the name *.partial may be left; the next command with this output removes it"
+    notes = with_flags(" ".join(getattr(end, "__notes__", ())))
+    tell_error(f"{how}. {left if is_second else notes or 'Nothing half-written is left'}.")
 
 
 def _cut(text: str, longest: int) -> str:
