@@ -283,10 +283,14 @@ def test_ctrl_c_before_a_command_begins(tmp_path: Path) -> None:
 def test_a_second_ctrl_c_that_cuts_the_clean_up_short_does_not_end_in_a_promise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    def interrupted() -> None:
+        with caught(), Target(tmp_path / "out.json") as target:
+            target.write(b"{")
+            raise KeyboardInterrupt
+
     monkeypatch.setattr(Target, "abandon", Mock(side_effect=KeyboardInterrupt))
-    with pytest.raises(SystemExit), caught(), Target(tmp_path / "out.json") as target:
-        target.write(b"{")
-        raise KeyboardInterrupt
+    with pytest.raises(SystemExit):
+        interrupted()
     assert len(partials(tmp_path)) == 1
     assert "error: interrupted. A file of the name *.partial may be left; " in capsys.readouterr().err
 

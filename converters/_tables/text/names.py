@@ -285,7 +285,8 @@ def distinct_names(names: list[str]) -> list[str]:
 
 def topic_of(column: str, taken: Collection[str], notes: list[str]) -> str:
     """Topic of a column in Latin letters; a note where it does not show the column."""
-    name = re.sub(r"[^A-Za-z0-9_]+", "_", column).strip("_") or "column"
+    distinct = leaf if (leaf := leaf_of(column)).startswith(group_of(column)) else column  # of speed/speed_left: speed_left
+    name = re.sub(r"[^A-Za-z0-9_]+", "_", distinct).strip("_") or "column"
     topic = f"/{name}" if name[0].isalpha() else f"/column_{name}"
     if topic in taken or topic == "/column":  # of a name that differs by marks, or is in other letters
         while topic in taken:
