@@ -133,7 +133,6 @@ def evaluate(
         figures(rows, aligned=aligned)
         for sentence in [*_used(results), *_late(results), *([] if report is None else [f"Report: {report}"])]:
             say(sentence)
-    _warn_of_fits(results)
     raise_kept([*errors, *_unfit(results)])
 
 
@@ -154,18 +153,16 @@ def _refuse_one_name(logs: Sequence[Path]) -> None:
             known[name] = path
 
 
-def _warn_of_fits(results: Sequence[dict[str, Any]]) -> None:
-    """Warn of the models that may not fit a log, as a view of it does."""
-    for row in results:
-        if row["estimate"] == "integration" and row["fit"]:
-            convert(row["fit"], Fitness).report(row["model"], row["log"], force=True)
-
-
 def _unfit(results: Sequence[dict[str, Any]]) -> list[ImutoolError]:
-    """Errors of scored models that `debias` would refuse."""
-    rows = [row for row in results if row["estimate"] == "integration" and row["fit"] and row["fit"]["verdict"] == "unfit"]
+    """Errors of scored models that `debias` would refuse; warns of all that may not fit a log."""
+    rows = [row for row in results if row["estimate"] == "integration" and row["fit"]]
+    verdicts = [convert(row["fit"], Fitness).report(row["model"], row["log"], force=True).verdict for row in rows]
     what, fix = "the model {model!r} does not fit this log, by its samples; the report has its scores", "Choose another model"
-    return [ModelError(what.format_map(row), where=row["log"], expected="a model of this sensor", fix=fix) for row in rows]
+    return [
+        ModelError(what.format_map(row), where=row["log"], expected="a model of this sensor", fix=fix)
+        for row, verdict in zip(rows, verdicts, strict=True)
+        if verdict == "unfit"
+    ]
 
 
 def _late(results: Sequence[dict[str, Any]]) -> list[str]:

@@ -124,7 +124,7 @@ def triples(sensor: str, *names: dict[str, str]) -> dict[str, dict[str, str]]:
 
 
 def is_compensated(column: str, time: str) -> bool:
-    """Whether the filter in the sensor has corrected a column, by its name or the time of a VectorNav next to it."""
+    """Whether the filter in the sensor has corrected a column, by its name or VectorNav's time."""
     raw = f"{UNCOMPENSATED}|{VECTORNAV_RAW}" if spaced_name(time) == "time_startup" else ""
     name = spaced_name(column)
     return bool(re.search(COMPENSATED, name) or (raw and not re.search(raw, name)))

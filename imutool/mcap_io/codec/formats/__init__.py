@@ -190,7 +190,10 @@ def vector_in(fields: Sequence[tuple[Path, str, Any]], pattern: str) -> tuple[Pa
 def imu_in(
     fields: Sequence[tuple[Path, str, Any]], gyro: str, accel: str, *, whole: bool = True
 ) -> tuple[Sequence[tuple[Path, str, Any]], tuple[Path, ...]] | None:
-    """Fields around the rates and the accelerations of an IMU, and the paths of those six; `whole`: also in two messages."""
+    """Fields next to an IMU's rates and accelerations, and the paths of those six numbers.
+
+    With `whole` the two may also lie in different parts of the message.
+    """
     parts: dict[Path, list[tuple[Path, str, Any]]] = {}
     for field in fields:
         parts.setdefault(field[0][:-1], []).append(field)
