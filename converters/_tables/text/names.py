@@ -105,7 +105,7 @@ RECORDINGS = (  # columns whose values tell recordings apart
 SENSORS = r"sensor|device|imu|node|placement|body_?(part|segment|location)|limb|(sensor|device|imu)_?(position|location)"
 UNCOMPENSATED = r"(^|_)un_?comp(ensated)?(_|$)"  # by the filter in a sensor, which removes the biases that it knows
 COMPENSATED = r"(^|_)comp(ensated)?(_|$)|(^|_)angularrate_"  # the second of VectorNav's messages
-VECTORNAV_RAW = r"(^|_)imu_(rate|accel)_[xyz]$"
+VECTORNAV_RAW = rf"{UNCOMPENSATED}|(^|_)imu_(rate|accel)_[xyz]$"
 CHINESE = {"加速度": "acc_", "角速度": "gyro_", "时间": "time"}  # of WitMotion's program
 AXES = {"0": "x", "1": "y", "2": "z"}
 TURNS = AXES | {"roll": "x", "pitch": "y", "yaw": "z", "p": "x", "q": "y", "r": "z"}
@@ -119,15 +119,14 @@ def triples(sensor: str, *names: dict[str, str]) -> dict[str, dict[str, str]]:
     tries = (_triples(sensor, spelled, form) for form in FORMS for spelled in names)
     found = next(filter(None, tries), {}) or _symbols(sensor, names[0])
     of_vectornav = any(name.endswith("imu_rate_x") for name in names[0].values())
-    raw = f"{UNCOMPENSATED}|{VECTORNAV_RAW}" if of_vectornav else UNCOMPENSATED
+    raw = VECTORNAV_RAW if of_vectornav else UNCOMPENSATED
     return {owner: axes for owner, axes in found.items() if re.search(raw, spaced_name(axes["x"]))} or found
 
 
 def is_compensated(column: str, time: str) -> bool:
     """Whether the filter in the sensor has corrected a column, by its name or VectorNav's time."""
-    raw = f"{UNCOMPENSATED}|{VECTORNAV_RAW}" if spaced_name(time) == "time_startup" else ""
-    name = spaced_name(column)
-    return bool(re.search(COMPENSATED, name) or (raw and not re.search(raw, name)))
+    name, of_vectornav = spaced_name(column), spaced_name(time) == "time_startup"
+    return re.search(COMPENSATED, name) is not None or (of_vectornav and re.search(VECTORNAV_RAW, name) is None)
 
 
 def _symbols(sensor: str, columns: Iterable[str]) -> dict[str, dict[str, str]]:
@@ -285,7 +284,8 @@ def distinct_names(names: list[str]) -> list[str]:
 
 def topic_of(column: str, taken: Collection[str], notes: list[str]) -> str:
     """Topic of a column in Latin letters; a note where it does not show the column."""
-    distinct = leaf if (leaf := leaf_of(column)).startswith(group_of(column)) else column  # of speed/speed_left: speed_left
+    leaf = leaf_of(column)
+    distinct = leaf if f"{leaf}_".startswith(f"{group_of(column)}_") else column  # of speed/speed_left: speed_left
     name = re.sub(r"[^A-Za-z0-9_]+", "_", distinct).strip("_") or "column"
     topic = f"/{name}" if name[0].isalpha() else f"/column_{name}"
     if topic in taken or topic == "/column":  # of a name that differs by marks, or is in other letters
