@@ -133,7 +133,7 @@ def _poses(topics: dict[str, Columns], ending: str, remarks: Remarks) -> Poses |
     remarks.notes.extend(q.notes)
     if not len(q.t_ns):
         return None
-    t_ns, q_ned_frd = q.t_ns, quaternion.unit(q.values)
+    t_ns, q_ned_frd_wxyz = q.t_ns, quaternion.unit(q.values)
     p_wb, v_w = np.zeros((len(t_ns), 3)), None
     has_position = position is not None and {*"xyz"} <= position.keys()
     if position is not None and has_position:
@@ -141,12 +141,12 @@ def _poses(topics: dict[str, Columns], ending: str, remarks: Remarks) -> Poses |
         moves = in_order(_sample_ns(position), _vectors(position, names), f"vehicle_local_position{ending}")
         if has_position := len(moves.t_ns) > 1:
             inside = (t_ns >= moves.t_ns[0]) & (t_ns <= moves.t_ns[-1])
-            t_ns, q_ned_frd, start = t_ns[inside], q_ned_frd[inside], moves.t_ns[0]
+            t_ns, q_ned_frd_wxyz, start = t_ns[inside], q_ned_frd_wxyz[inside], moves.t_ns[0]
             both = interpolate((t_ns - start).astype(float), (moves.t_ns - start).astype(float), moves.values)
             p_wb, v_w = both[:, :3] * UP_FROM_DOWN, both[:, 3:] * UP_FROM_DOWN if both.shape[1] > 3 else None
     if not has_position:
         remarks.notes.append(f"vehicle_attitude{ending} has no positions with it: those of its poses are zero")
-    return Poses(t_ns, p_wb, quaternion.unit(quaternion.enu_from_ned(q_ned_frd)), v_w)
+    return Poses(t_ns, p_wb, quaternion.unit(quaternion.enu_from_ned(q_ned_frd_wxyz)), v_w)
 
 
 def log_of(

@@ -173,9 +173,9 @@ def _poses(messages: dict[str, Messages], remarks: Remarks) -> dict[str, Poses]:
     values = np.stack([*(rows[f] for f in POSE_FIELDS[:6]), *angles], axis=1).astype(float)
     kept = in_order(group.t_ns, values, "/ekf/pose")
     remarks.notes.extend(kept.notes)
-    q_wb = quaternion.enu_from_ned(quaternion.of_roll_pitch_yaw(np.radians(kept.values[:, 6:])))
+    q_wb_wxyz = quaternion.enu_from_ned(quaternion.of_roll_pitch_yaw(np.radians(kept.values[:, 6:])))
     up = np.array([1.0, 1.0, -1.0])
-    return {"/ekf/pose": Poses(kept.t_ns, kept.values[:, :3] * up, quaternion.unit(q_wb), kept.values[:, 3:6] * up)}
+    return {"/ekf/pose": Poses(kept.t_ns, kept.values[:, :3] * up, quaternion.unit(q_wb_wxyz), kept.values[:, 3:6] * up)}
 
 
 def _simulated_poses(messages: dict[str, Messages], remarks: Remarks) -> dict[str, Poses]:
@@ -190,8 +190,8 @@ def _simulated_poses(messages: dict[str, Messages], remarks: Remarks) -> dict[st
     if not len(kept.t_ns):
         return {}
     north, east, down = plane(kept.values[:, :3] * [*2 * [np.radians(1e-7)], 1.0]).T
-    q_wb = quaternion.enu_from_ned(quaternion.unit(kept.values[:, 3:]))
-    return {TRUTH: Poses(kept.t_ns, np.stack([east, north, -down], axis=1), quaternion.unit(q_wb))}
+    q_wb_wxyz = quaternion.enu_from_ned(quaternion.unit(kept.values[:, 3:]))
+    return {TRUTH: Poses(kept.t_ns, np.stack([east, north, -down], axis=1), quaternion.unit(q_wb_wxyz))}
 
 
 def _table(name: str, messages: Messages) -> Table:

@@ -353,6 +353,22 @@ def test_no_local_name_is_a_figure_of_speech() -> None:
     assert found == []
 
 
+def quaternions_without_order(tree: ast.Module) -> Iterator[str]:
+    """Names q_AB of quaternions, of arguments, variables and fields, that do not say the order of their numbers."""
+    named = (
+        (node.arg if isinstance(node, ast.arg) else node.id) for node in nodes(tree) if isinstance(node, ast.arg | ast.Name)
+    )
+    yield from (name for name in named if re.fullmatch(r"q_\w+(?<!_wxyz)(?<!_xyzw)", name))
+
+
+def test_quaternions_say_their_order() -> None:
+    assert {name: found for name, tree in everything().items() if (found := [*quaternions_without_order(tree)])} == {}
+    assert [*quaternions_without_order(ast.parse("def f(q_wb, q_wb_wxyz):\n    q_wa, q = q_wb, q_wb_wxyz"))][:2] == [
+        "q_wb",
+        "q_wa",
+    ]
+
+
 PRIVATE_PHRASES = ("what is told", "what is said", "is had", "cannot be had", "nothing of it", "is no longer told")
 
 

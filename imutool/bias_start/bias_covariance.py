@@ -112,9 +112,9 @@ class ExpectedDrift:
             self._done = b
             if log_drift is not None:
                 rest = rest + log_drift.covariance(t_ns[a:b])
-            q_wb = path.q_wb_wxyz[np.searchsorted(path.t_ns, t_ns[a : b + 1])]
-            force_w = quaternion.rotate(q_wb, accel[a : b + 1])
-            by_bias = drift_by_bias(seconds(t_ns[a : b + 1], int(first_ns)), q_wb, force_w)[:-1]
+            q_wb_wxyz = path.q_wb_wxyz[np.searchsorted(path.t_ns, t_ns[a : b + 1])]
+            force_w = quaternion.rotate(q_wb_wxyz, accel[a : b + 1])
+            by_bias = drift_by_bias(seconds(t_ns[a : b + 1], int(first_ns)), q_wb_wxyz, force_w)[:-1]
             constant, moving = by_bias.sum(axis=0), np.einsum("nij,njp->ip", by_bias, stacked(roots, b - a))
             out[k] = constant @ rest.mean(axis=0) @ constant.T + moving @ moving.T
         return out

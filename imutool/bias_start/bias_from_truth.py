@@ -82,10 +82,10 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     residual = np.concatenate([piece.gyro, piece.accel], axis=1) - model.stream(start.rest)(*relative_samples(piece))
     alone = poses_turn_alone(replace(piece, gyro=residual[:, :3]), truth)
     mount_std = OWN_MOUNT_STD if model.card else MOUNT_STD
-    q, v_w, known = quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows]
+    q_wxyz, v_w, known = quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows]
     parts = [np.arange(len(t[rows])), *np.array_split(np.arange(len(t[rows])), PARTS)]
     offset, *thirds = [
-        bias_from_truth(t[rows][at], residual[at], q[at], v_w[at], known[at], mount_std, alone[at])
+        bias_from_truth(t[rows][at], residual[at], q_wxyz[at], v_w[at], known[at], mount_std, alone[at])
         for at in parts
         if known[at].sum() > 1
     ]
@@ -253,10 +253,10 @@ def _attitudes(
     t_s: Float64[np.ndarray, " n"], rate: Vectors, q_wb_wxyz: Quaternions, trusted: Bool[np.ndarray, " n"]
 ) -> Quaternions:
     """Integrated attitude, corrected by its error at trusted poses, interpolated in gaps."""
-    q_hat = np.concatenate([q_wb_wxyz[:1], quaternion.multiply(q_wb_wxyz[:1], _integrated(rate, np.diff(t_s)[:, None]))])
-    error = quaternion.log(quaternion.multiply(quaternion.inverse(q_hat), q_wb_wxyz))
+    q_hat_wxyz = np.concatenate([q_wb_wxyz[:1], quaternion.multiply(q_wb_wxyz[:1], _integrated(rate, np.diff(t_s)[:, None]))])
+    error = quaternion.log(quaternion.multiply(quaternion.inverse(q_hat_wxyz), q_wb_wxyz))
     filled = [np.interp(t_s, t_s[trusted], error[trusted, axis]) for axis in range(3)]
-    return quaternion.unit(quaternion.multiply(q_hat, quaternion.exp(np.stack(filled, axis=1))))
+    return quaternion.unit(quaternion.multiply(q_hat_wxyz, quaternion.exp(np.stack(filled, axis=1))))
 
 
 def _slope(

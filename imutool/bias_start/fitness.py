@@ -152,9 +152,11 @@ def _untrained(start: InitialBias, samples: Samples) -> Fitness:
     if np.linalg.norm(start.rest[:3]) > TELLING[0] / 2.0 and (shown := refuted_stops(samples, static.Model())):
         in_motion, turned = contradicted_start(start.rest, start.std, shown[0], DEPENDENT * shown[1] + ONLY_GYRO)
         other_start, harmful = [*other_start, *in_motion, STEADY_TURN], harmful or turned
-    doubts = (*other_start, *changed_at_rest(samples, stops_in(samples), UNTRAINED))
-    trained = f"it needs no training; trained models ship for {', '.join(units)}"
-    return Fitness("unfit" if harmful else "doubtful" if doubts else "fits", (*doubts, trained))
+    stops = stops_in(samples)
+    doubts = (*other_start, *changed_at_rest(samples, stops, UNTRAINED))
+    agreement = "its bias agrees with the gyro at rest" if stops else "the log has no stop that could contradict its bias"
+    trained = f"trained models ship for {', '.join(units)}"
+    return Fitness("unfit" if harmful else "doubtful" if doubts else "fits", (*(doubts or (agreement,)), trained))
 
 
 def head(batches: Iterable[Samples]) -> Samples:

@@ -71,7 +71,7 @@ class ReportedNoise(Struct):
 class Findings(Struct):
     """Report of `diagnose` (imutool.diagnosis/1), as far as it is scored."""
 
-    mismatch: bool
+    mismatch: bool | None
     located: list[ReportedLocation]
     findings: list[ReportedFinding]
     unexplained: ReportedNoise

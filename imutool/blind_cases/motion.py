@@ -75,8 +75,8 @@ class Motion:
 
     def pose(self, t_s: Times) -> tuple[Vectors, Float64[np.ndarray, "n 4"]]:
         """Position and unit quaternion (wxyz) at some times."""
-        q = self.quaternion(t_s)
-        return np.asarray(self.position(t_s)), q / np.linalg.norm(q, axis=1, keepdims=True)
+        q_wxyz = self.quaternion(t_s)
+        return np.asarray(self.position(t_s)), q_wxyz / np.linalg.norm(q_wxyz, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,13 +116,13 @@ def smoother(poses: Poses) -> Smoother:
             fix="Choose a longer trajectory",
         )
     t = seconds(poses.t_ns, int(poses.t_ns[0]))
-    q = poses.q_wb_wxyz * _signs(poses.q_wb_wxyz)[:, None]
+    q_wxyz = poses.q_wb_wxyz * _signs(poses.q_wb_wxyz)[:, None]
     knots = _knots(0.0, float(t[-1]))
     penalties, weights = [], {}
-    for name, y, spurious in (("p", poses.p_wb, SPURIOUS[0]), ("q", q, SPURIOUS[1] / 2.0)):  # |q'| is half the rate
+    for name, y, spurious in (("p", poses.p_wb, SPURIOUS[0]), ("q", q_wxyz, SPURIOUS[1] / 2.0)):  # |q'| is half the rate
         penalties.append(_penalty(t, y, spurious))
         weights[name] = _robust_weights(t, y, knots, penalties[-1])
-    return Smoother(t, poses.p_wb, q, (penalties[0], penalties[1]), weights)
+    return Smoother(t, poses.p_wb, q_wxyz, (penalties[0], penalties[1]), weights)
 
 
 def _penalty(t: Times, y: Float64[np.ndarray, "n k"], spurious: float) -> float:
@@ -174,9 +174,9 @@ def _solve(t: Times, y: Float64[np.ndarray, "n k"], weights: Times, knots: Knots
     return BSpline(knots, solveh_banded(band, weighted.T @ y), DEGREE)
 
 
-def _signs(q: Float64[np.ndarray, "n 4"]) -> Times:
+def _signs(q_wxyz: Float64[np.ndarray, "n 4"]) -> Times:
     """Signs that keep neighbours in one hemisphere."""
-    return np.concatenate([[1.0], np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))])
+    return np.concatenate([[1.0], np.cumprod(np.where(np.sum(q_wxyz[1:] * q_wxyz[:-1], axis=1) < 0.0, -1.0, 1.0))])
 
 
 def _vector_part(a: Float64[np.ndarray, "n 4"], b: Float64[np.ndarray, "n 4"]) -> Vectors:
@@ -185,9 +185,9 @@ def _vector_part(a: Float64[np.ndarray, "n 4"], b: Float64[np.ndarray, "n 4"]) -
     return out
 
 
-def _matrix(q: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 3 3"]:
+def _matrix(q_wxyz: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 3 3"]:
     """Rotation matrices of unit quaternions wxyz."""
-    w, x, y, z = q.T
+    w, x, y, z = q_wxyz.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

@@ -145,10 +145,10 @@ class Scene:
     def poses(self, acting: Acting, noise: tuple[float, float], rng: Generator) -> Poses:
         """Poses of the reference, with noise (m, rad)."""
         t_s = np.arange(int(self.duration_s * POSE_RATE_HZ) + 1) / POSE_RATE_HZ
-        p_wb, q = self.reference(acting).pose(t_s + self.start_s)
+        p_wb, q_wxyz = self.reference(acting).pose(t_s + self.start_s)
         p_wb = p_wb + noise[0] * rng.standard_normal(p_wb.shape)
         half = 0.5 * noise[1] * rng.standard_normal(p_wb.shape)
-        w, v = q[:, :1], q[:, 1:]
+        w, v = q_wxyz[:, :1], q_wxyz[:, 1:]
         turned = np.concatenate([w - np.sum(v * half, axis=1)[:, None], v + w * half + np.cross(v, half)], axis=1)
         turned /= np.linalg.norm(turned, axis=1, keepdims=True)
         return Poses(stamps_ns(t_s), p_wb, turned)

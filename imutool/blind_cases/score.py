@@ -116,7 +116,7 @@ def _score(truth: ConcealedTruth, found: Findings, sim: Recording | None) -> Sco
         size=truth.size,
         concealed=tuple(effect.effect for effect in truth.effects),
         found=tuple(finding.effect for finding in findings),
-        detected=bool(findings) or found.mismatch,
+        detected=bool(findings or found.mismatch),
         right=not missing and not wrong,
         hits=tuple(effect.effect for effect, _ in hits),
         missing=tuple(effect.effect for effect in missing),

@@ -76,7 +76,7 @@ def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventio
         forces = _force_at_poses(step, force, motion.middle_ns, poses)
         accel, up, unit, other = _accel_against_poses(forces, gyro, carried)
         conventions = Conventions(truth.topic, gyro, accel, carried, up, delay, unit, what or other, _mean_vertical(forces))
-        turned = quaternion.rotate(forces.q_wb, forces.f @ gyro.axes.T) if gyro is not None else forces.f[:0]
+        turned = quaternion.rotate(forces.q_wb_wxyz, forces.f @ gyro.axes.T) if gyro is not None else forces.f[:0]
         level = len(turned) > 0 and axis_of_gravity(turned) == "+z"
         found.append((conventions, (up == "+z", accel is not None, level)))
     return max(found, key=lambda each: each[1])[0]  # of equals the first
@@ -158,10 +158,10 @@ def _carried(
     errors = np.empty((len(readings), len(rate)))
     for unit, rotates in dict.fromkeys(zip(units.tolist(), proper.tolist(), strict=True)):
         of, factor = P[alike := (units == unit) & (proper == rotates)], (1.0 if rotates else -1.0) * RATES[unit] * STEP_S
-        q = quaternion.exp(np.zeros((len(rate), 3)))
+        q_wxyz = quaternion.exp(np.zeros((len(rate), 3)))
         for k in range(WINDOW):
-            q = quaternion.multiply(q, quaternion.exp(factor * rate[:, k]))
-        turned = quaternion.rotate(np.tile(q, (len(of), 1)), (last @ of).reshape(-1, 3)).reshape(len(of), -1, 3)
+            q_wxyz = quaternion.multiply(q_wxyz, quaternion.exp(factor * rate[:, k]))
+        turned = quaternion.rotate(np.tile(q_wxyz, (len(of), 1)), (last @ of).reshape(-1, 3)).reshape(len(of), -1, 3)
         errors[alike] = np.linalg.norm(turned @ of.swapaxes(1, 2) - first, axis=2)
     return errors
 
@@ -238,22 +238,22 @@ class _Forces(NamedTuple):
     """Times of the poses that have samples, their orientation and acceleration, and the specific force there."""
 
     t_s: Float64[np.ndarray, " n"]
-    q_wb: Float64[np.ndarray, "n 4"]
+    q_wb_wxyz: Float64[np.ndarray, "n 4"]
     a_w: Float64[np.ndarray, "n 3"]
     f: Float64[np.ndarray, "n 3"]
 
 
 def _force_at_poses(step: Int64[np.ndarray, " m"], accel: Float64[np.ndarray, "m 3"], start_ns: int, truth: Truth) -> _Forces:
-    at_ns, q_wb, a_w = force_in_world(truth)
+    at_ns, q_wb_wxyz, a_w = force_in_world(truth)
     use, first_s, _ = usable(at_ns, at_ns + 1, start_ns, step)
-    return _Forces(first_s, q_wb[use], a_w[use], interpolate(first_s, STEP_S * (step + 0.5), accel))
+    return _Forces(first_s, q_wb_wxyz[use], a_w[use], interpolate(first_s, STEP_S * (step + 0.5), accel))
 
 
 def _mean_vertical(forces: _Forces) -> float | None:
     """Mean specific force along the z of the poses; their own acceleration has no mean worth naming over `MIN_MEAN_S`."""
     if not len(forces.f) or forces.t_s[-1] - forces.t_s[0] < MIN_MEAN_S:
         return None
-    return float(quaternion.rotate(forces.q_wb, forces.f)[:, 2].mean())
+    return float(quaternion.rotate(forces.q_wb_wxyz, forces.f)[:, 2].mean())
 
 
 def _accel_against_poses(
@@ -263,7 +263,7 @@ def _accel_against_poses(
 
     a_w + g up = R_wb axes f. Without acceleration, or in noise, (axes, up) and (-axes, -up) fit alike: the up of right axes.
     """
-    first_s, q_wb, a_w, f = forces
+    first_s, q_wb_wxyz, a_w, f = forces
     if len(f) < FEWEST_BLOCKS:
         return None, None, "m", ""
     ups = np.concatenate([np.eye(3)[2:], -np.eye(3)[2:], np.eye(3)[:2], -np.eye(3)[:2]])
@@ -272,26 +272,26 @@ def _accel_against_poses(
         agreed = np.linalg.det(gyro.axes) * gyro.axes @ relative.axes.T * np.linalg.det(relative.axes)
         every = np.stack([agreed, -agreed])
     readings = [(P, up) for P in every for up in ups]
-    turned = np.stack([quaternion.rotate(q_wb, f @ P.T) for P in every])
+    turned = np.stack([quaternion.rotate(q_wb_wxyz, f @ P.T) for P in every])
     blocks, misfits = (first_s / BLOCKS_S).astype(np.int64), Misfits(a_w, turned, GRAVITY_M_S2 * ups)
     unit = position_unit(misfits, blocks)
     misfits = misfits._replace(a_w=POSITIONS[unit] * misfits.a_w)
     a_w, choice = misfits.a_w, choose(misfits.sizes(1.0), blocks)
     straight = gyro is not None and gyro.as_is and (gyro.sole or gyro.straight)
     misfit = np.zeros((0, 3)) if choice is None else misfits.of(1.0, choice.best)
-    if straight and is_other_world(f, q_wb, a_w, misfit, blocks):
+    if straight and is_other_world(f, q_wb_wxyz, a_w, misfit, blocks):
         return None, None, unit, OTHER_WORLD
     contradicted = relative is not None and relative.wrong  # then the mean force is in other axes than the gyro's
-    in_mean = axis_of_gravity(quaternion.rotate(q_wb, f)) if straight and not contradicted else None
+    in_mean = axis_of_gravity(quaternion.rotate(q_wb_wxyz, f)) if straight and not contradicted else None
     if choice is None or choice.misfit[choice.best] > CLEARLY * GRAVITY_M_S2:
         return None, in_mean, unit, ""
     rows = sorted(np.flatnonzero(choice.alike).tolist(), key=lambda row: row != choice.best)
     if contradicted and gyro is not None and gyro.sole:  # a mirrored accel in a world z down fits alike
         rows = [row for row in rows if np.linalg.det(readings[row][0]) > 0.0 and readings[row][1][2] > 0.0] or rows
     P, up = readings[rows[0]]
-    if straight and up[2] < 0.0 and (np.diag([1.0, 1.0, -1.0]) == P).all() and stays_level(q_wb):  # mirrored, it fits alike
+    if straight and up[2] < 0.0 and (np.diag([1, 1, -1]) == P).all() and stays_level(q_wb_wxyz):  # mirrored, it fits alike
         return None, in_mean, unit, ""
-    as_is = float(np.sqrt(median(np.sum((a_w + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb, f)) ** 2, axis=1))))
+    as_is = float(np.sqrt(median(np.sum((a_w + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb_wxyz, f)) ** 2, axis=1))))
     one_axes, one_up = (all((readings[row][part] == readings[rows[0]][part]).all() for row in rows) for part in (0, 1))
     found = Reading(P, "m/s^2", choice.certain, float(choice.misfit[rows[0]]), as_is) if one_axes else None
     named = axis_of_gravity(GRAVITY_M_S2 * up[None]) if one_up else in_mean

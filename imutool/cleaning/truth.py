@@ -99,10 +99,11 @@ def turning(
     truth: Truth, spacing: int = 1
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
     """Angular rate (rad/s, body) between poses `spacing` rows apart, with start and end (ns)."""
-    q_wb = quaternion.unit(truth.q_wb_wxyz)
+    q_wb_wxyz = quaternion.unit(truth.q_wb_wxyz)
     first, last = truth.t_ns[:-spacing], truth.t_ns[spacing:]
     dt = seconds(last, int(truth.t_ns[0])) - seconds(first, int(truth.t_ns[0]))
-    return first, last, quaternion.log(quaternion.multiply(quaternion.inverse(q_wb[:-spacing]), q_wb[spacing:])) / dt[:, None]
+    turn = quaternion.log(quaternion.multiply(quaternion.inverse(q_wb_wxyz[:-spacing]), q_wb_wxyz[spacing:]))
+    return first, last, turn / dt[:, None]
 
 
 def axis_of_gravity(force_w: Float64[np.ndarray, "n 3"]) -> str | None:
@@ -113,9 +114,9 @@ def axis_of_gravity(force_w: Float64[np.ndarray, "n 3"]) -> str | None:
     return f"{'+' if mean[axis] > 0.0 else '-'}{'xyz'[axis]}" if along else None
 
 
-def stays_level(q_wb: Float64[np.ndarray, "n 4"]) -> bool:
+def stays_level(q_wb_wxyz: Float64[np.ndarray, "n 4"]) -> bool:
     """Whether a body turns about the vertical alone, but for less than a mount may be tilted."""
-    vertical = quaternion.rotate(q_wb, np.tile([0.0, 0.0, 1.0], (len(q_wb), 1)))
+    vertical = quaternion.rotate(q_wb_wxyz, np.tile([0.0, 0.0, 1.0], (len(q_wb_wxyz), 1)))
     return bool(np.sqrt(vertical.var(axis=0).sum()) < LEVEL_RAD)
 
 

@@ -131,7 +131,7 @@ def evaluate(
     if not common.write(Evaluation(convert(results, list[Score]))):
         rows = [{**row, "model": f"{row['model']} aided"} if row["estimate"] == "aided" else row for row in results]
         figures(rows, aligned=aligned)
-        for sentence in [*_used(results), *_late(results), *_fits(results), *([] if report is None else [f"Report: {report}"])]:
+        for sentence in [*_used(results), *_late(results), *([] if report is None else [f"Report: {report}"])]:
             say(sentence)
     raise_kept([*errors, *_unfit(results)])
 
@@ -153,17 +153,16 @@ def _refuse_one_name(logs: Sequence[Path]) -> None:
             known[name] = path
 
 
-def _fits(results: Sequence[dict[str, Any]]) -> list[str]:
-    """Sentences about the models that may not fit a log."""
-    rows = [row for row in results if row["estimate"] == "integration" and row["fit"] and row["fit"]["verdict"] != "fits"]
-    return [f"{row['log']}: {convert(row['fit'], Fitness).sentence(row['model'])}" for row in rows]
-
-
 def _unfit(results: Sequence[dict[str, Any]]) -> list[ImutoolError]:
-    """Errors of scored models that `debias` would refuse."""
-    rows = [row for row in results if row["estimate"] == "integration" and row["fit"] and row["fit"]["verdict"] == "unfit"]
+    """Errors of scored models that `debias` would refuse; warns of all that may not fit a log."""
+    rows = [row for row in results if row["estimate"] == "integration" and row["fit"]]
+    verdicts = [convert(row["fit"], Fitness).report(row["model"], row["log"], force=True).verdict for row in rows]
     what, fix = "the model {model!r} does not fit this log, by its samples; the report has its scores", "Choose another model"
-    return [ModelError(what.format_map(row), where=row["log"], expected="a model of this sensor", fix=fix) for row in rows]
+    return [
+        ModelError(what.format_map(row), where=row["log"], expected="a model of this sensor", fix=fix)
+        for row, verdict in zip(rows, verdicts, strict=True)
+        if verdict == "unfit"
+    ]
 
 
 def _late(results: Sequence[dict[str, Any]]) -> list[str]:

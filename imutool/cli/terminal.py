@@ -77,7 +77,10 @@ def tell_error(message: str) -> None:
 
 def tell_end(how: str, end: BaseException) -> None:
     """Print how a command ended too early; notes of the exception say how to go on."""
-    tell_error(f"{how}. {with_flags(' '.join(getattr(end, '__notes__', ()))) or 'Nothing half-written is left'}.")
+    is_second = end.__cause__ is None and isinstance(end.__context__, KeyboardInterrupt | SystemExit)  # ended the clean-up
+    left = "A file of the name *.partial may be left; the next command with this output removes it"
+    notes = with_flags(" ".join(getattr(end, "__notes__", ())))
+    tell_error(f"{how}. {left if is_second else notes or 'Nothing half-written is left'}.")
 
 
 def _cut(text: str, longest: int) -> str:
@@ -184,22 +187,26 @@ def raise_kept(errors: Sequence[ImutoolError]) -> None:
 
 
 class _Lines(logging.Handler):
-    """Handler that prints log records on stderr, above the progress bar; what logs in a row have alike in one line more."""
+    """Handler that prints log records on stderr, a warning once; what logs in a row have alike in one line more."""
 
     def __init__(self) -> None:
         super().__init__()
         self._level, self._text, self._logs = "", "", list[str]()
+        self._warnings = set[str]()
 
     def emit(self, record: logging.LogRecord) -> None:
-        log, colon, text = record.getMessage().partition(": ")
-        level = record.levelname.lower()
+        message, level = record.getMessage(), record.levelname.lower()
+        if record.levelno >= logging.WARNING:
+            if message in self._warnings:  # a command may read a log twice
+                return
+            self._warnings.add(message)
+        log, colon, text = message.partition(": ")
         if colon and (level, text) == (self._level, self._text):
-            if log not in self._logs:  # a command may read a log twice
-                self._logs.append(log)
+            self._logs.append(log)
             return
         self.flush()
         self._level, self._text, self._logs = level, text, [log]
-        say(with_flags(f"{level}: {record.getMessage()}"), to=err)
+        say(with_flags(f"{level}: {message}"), to=err)
 
     def flush(self) -> None:
         """Name the other logs of the last text."""

@@ -56,7 +56,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 continue
             survey = look(log, topic, CleaningSettings(fix=True))
             kept += [f"{topic}: {step}" for step in survey.clock_steps]
-            kept += [f"{topic}: {f.distrust}, which stays" for f in survey.findings if f.rule == "units" and f.distrust]
+            kept += [f"{topic}: {f.what}; its unit stays" for f in survey.findings if f.rule == "units" and f.distrust]
             mount = None if poses.frame_id or (survey.mount == np.eye(3)).all() else survey.mount
             if poses.frame_id:  # the next round judges by the corrected poses
                 survey = replace(survey, axes=AS_RECORDED)

@@ -73,6 +73,8 @@ def reflection_note(topic: MessageTopic, found: Reflected | Transforms) -> str:
     note = f"{topic.name}: {topic.message_encoding} became {found.schema_name}, taken as {units}"
     if isinstance(found, Reflected) and found.pose is not None:
         note = f"{note}; its poses are on {topic.name}/pose"
+    if isinstance(found, Reflected) and found.compensated:
+        note = f"{note}; {found.compensated}"
     if isinstance(found, Reflected) and found.stamp_unit:
         return f"{note}; {found.stamp_path} is in {found.stamp_unit}, {BY_LOG_TIMES}"
     return note if found.stamp else f"{note}; at the {LOG_TIME}, {WITHOUT_STAMP}"

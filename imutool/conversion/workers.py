@@ -202,6 +202,7 @@ def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
         lacking = () if log.imu_topics else (f"no topic is an IMU{joined}",)
         own = {name: topic.reflected for name, topic in log.topics.items() if isinstance(topic.reflected, Reflected)}
     stated = [f"{name}: {found.units}, by the comments of its definition" for name, found in own.items() if found.units]
+    stated += [f"{name}: {found.compensated}" for name, found in own.items() if found.compensated]
     notes = *filter(None, [job.note]), *labelled.remarks.notes, *stated, *lacking
     return Outcome(None, notes, tuple(labelled.remarks.losses), mapping=labelled.metadata.get(MAP, {}))
 

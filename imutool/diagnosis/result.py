@@ -181,6 +181,7 @@ class DiagnosisReport(Report, frozen=True, tag=SCHEMA):
     """Findings of a diagnosis as JSON (`imutool.diagnosis/1`).
 
     Attributes:
+        mismatch: null where nothing could be compared and no sample shows a defect; `remarks` say why.
         bias: of the first log; `biases` has one for each log.
         unexplained: `SIGNAL_rms` of each signal, `noise_floor` by signal, and whether all residuals are `white`.
         imus: rotation, lever arm and clock of the log's other IMUs against this one, by topic.
@@ -188,7 +189,7 @@ class DiagnosisReport(Report, frozen=True, tag=SCHEMA):
 
     real: tuple[str, ...]
     sim: str | None
-    mismatch: bool
+    mismatch: bool | None
     located: tuple[Located, ...]
     findings: tuple[Finding, ...]
     bias: Bias
@@ -251,7 +252,8 @@ class Diagnosis:
 
     def __repr__(self) -> str:
         found = ", ".join(f"{f.effect} ({f.signal}, {f.share:.0%})" for f in self.findings)
-        return f"<diagnosis of {', '.join(self.real)}: {found or ('no name' if self.located else 'a constant bias at most')}>"
+        unnamed = {True: "no name", False: "a constant bias at most", None: "nothing could be compared"}[self.mismatch]
+        return f"<diagnosis of {', '.join(self.real)}: {found or unnamed}>"
 
     @classmethod
     def without_imu(cls, reals: Sequence[Location], sim: Location) -> Diagnosis:
@@ -259,9 +261,10 @@ class Diagnosis:
         return cls(tuple(map(str, reals)), str(sim), (), (), np.full((len(reals), 6), np.nan), (), {})
 
     @property
-    def mismatch(self) -> bool:
-        """Whether more than a constant bias and noise separates the two."""
-        return bool(self.findings) or bool(self.located)
+    def mismatch(self) -> bool | None:
+        """Whether more than a constant bias and noise separates the two; None where nothing could be compared."""
+        differs = bool(self.findings or self.located)
+        return differs if differs or self.unexplained else None
 
     @property
     def report(self) -> DiagnosisReport:
@@ -293,5 +296,5 @@ def _unexplained(residuals: Mapping[str, Unexplained]) -> dict[str, float | bool
     return {
         **{f"{signal}_rms": residual.rms for signal, residual in by_signal.items()},
         "noise_floor": {signal: residual.noise_floor for signal, residual in by_signal.items()},
-        "white": all(residual.white for residual in residuals.values()),
+        "white": all(residual.white for residual in residuals.values()) if residuals else np.nan,
     }

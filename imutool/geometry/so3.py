@@ -87,8 +87,8 @@ def log(R: Rotations) -> Vectors:
     exactly pi two opposite vectors are correct and one is returned; below pi the derivative is finite. R must be a rotation:
     an error off the manifold is projected, not reported.
     """
-    q = quaternion_wxyz_from_matrix(R)
-    w, v = q[..., :1], q[..., 1:]
+    q_wxyz = quaternion_wxyz_from_matrix(R)
+    w, v = q_wxyz[..., :1], q_wxyz[..., 1:]
     return 2.0 * _atan2_over(_squared(v).unsqueeze(-1), w) * v
 
 

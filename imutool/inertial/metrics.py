@@ -159,8 +159,9 @@ class AbsoluteErrors:
 
 def _turned_deg(estimate: Poses, truth: Poses, turn: Float64[np.ndarray, "1 4"] | None = None) -> Float64[np.ndarray, " n"]:
     """Angles between the orientations of two paths, of which the first may be turned."""
-    q, q_true = quaternion.unit(estimate.q_wb_wxyz), quaternion.unit(truth.q_wb_wxyz)  # six decimals would count as an angle
-    return np.asarray(np.degrees(quaternion.angle_between(q if turn is None else quaternion.multiply(turn, q), q_true)))
+    q_wxyz, q_true_wxyz = (quaternion.unit(poses.q_wb_wxyz) for poses in (estimate, truth))  # six decimals would count
+    turned_wxyz = q_wxyz if turn is None else quaternion.multiply(turn, q_wxyz)
+    return np.asarray(np.degrees(quaternion.angle_between(turned_wxyz, q_true_wxyz)))
 
 
 def _aligned_squares(
@@ -194,13 +195,13 @@ class RelativeErrors:
         before = self._p_true[-1:] if len(self._p_true) else truth.p_wb[:1]
         steps = quaternion.length(np.diff(np.concatenate([before, truth.p_wb]), axis=0))
         travelled = np.cumsum(np.concatenate([self._travelled[-1:], steps]))[-len(steps) :]
-        q, q_true = quaternion.unit(estimate.q_wb_wxyz), quaternion.unit(truth.q_wb_wxyz)
+        q_wxyz, q_true_wxyz = quaternion.unit(estimate.q_wb_wxyz), quaternion.unit(truth.q_wb_wxyz)
         first = int(min(self._next, default=0))
         self._next -= first
         self._travelled = np.concatenate([self._travelled[first:], travelled])
         self._p = np.concatenate([self._p[first:], estimate.p_wb])
         self._p_true = np.concatenate([self._p_true[first:], truth.p_wb])
-        self._C = np.concatenate([self._C[first:], quaternion.multiply(q_true, quaternion.inverse(q))])
+        self._C = np.concatenate([self._C[first:], quaternion.multiply(q_true_wxyz, quaternion.inverse(q_wxyz))])
         for k, distance_m in enumerate(self._distances_m):
             ended = int(np.searchsorted(self._travelled + distance_m, self._travelled[-1], side="right"))
             self._add_pairs(k, min(ended, len(self._travelled) - 1))

@@ -70,25 +70,26 @@ def dead_reckon(
     """
     if not len(imu):
         raise DataError("the IMU has no samples", expected="at least one")
-    q_0, p_0, v_0 = (np.asarray(part, dtype=np.float64) for part in start)
+    q_0_wxyz, p_0, v_0 = (np.asarray(part, dtype=np.float64) for part in start)
     dt = np.diff(seconds(imu.t_ns, int(imu.t_ns[0])))[:, None]
     with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below with its row
-        q_wb = quaternion.running_product(np.concatenate([quaternion.unit(q_0[None]), quaternion.exp(imu.gyro[:-1] * dt)]))
-        q_wb /= quaternion.length(q_wb)[:, None]  # in place, as below: few arrays as long as the log at once
-        v_w = np.concatenate([v_0[None], quaternion.rotate(q_wb[:-1], imu.accel[:-1])])
+        first_wxyz = quaternion.unit(q_0_wxyz[None])
+        q_wb_wxyz = quaternion.running_product(np.concatenate([first_wxyz, quaternion.exp(imu.gyro[:-1] * dt)]))
+        q_wb_wxyz /= quaternion.length(q_wb_wxyz)[:, None]  # in place, as below: few arrays as long as the log at once
+        v_w = np.concatenate([v_0[None], quaternion.rotate(q_wb_wxyz[:-1], imu.accel[:-1])])
         np.multiply(np.add(v_w[1:], g_w, out=v_w[1:]), dt, out=v_w[1:])
         np.cumsum(v_w, axis=0, out=v_w)
         p_wb = np.cumsum(np.concatenate([p_0[None], v_w[:-1] * dt]), axis=0)
-    if not all(np.isfinite(column).all() for column in (q_wb, v_w, p_wb)):
-        row = int(np.argmin(np.isfinite(np.concatenate([q_wb, v_w, p_wb], axis=1)).all(axis=1)))
+    if not all(np.isfinite(column).all() for column in (q_wb_wxyz, v_w, p_wb)):
+        row = int(np.argmin(np.isfinite(np.concatenate([q_wb_wxyz, v_w, p_wb], axis=1)).all(axis=1)))
         raise NumericsError(
             f"integration overflows at {imu.t_ns[row]} ns",
             expected="rates and forces of a moving body",
             fix="Check gyro and accel just before that sample",
         )
-    for column in (p_wb, q_wb, v_w):  # so that the poses need no copy
+    for column in (p_wb, q_wb_wxyz, v_w):  # so that the poses need no copy
         column.flags.writeable = False
-    return Poses(imu.t_ns, p_wb, q_wb, v_w)
+    return Poses(imu.t_ns, p_wb, q_wb_wxyz, v_w)
 
 
 def gaps_crossed(t_ns: Times, longer_s: float, start_ns: int) -> str:
@@ -171,12 +172,13 @@ def window_drift(path: Poses, truth: Poses, first: Indices, last: Indices | slic
 def _drift_of(path: Poses, truth: Poses, first: Indices, last: Indices, T: Column, S: Column) -> Drift:
     """Drift of some windows, as `window_drift`."""
     g_T, g_S = np.array(GRAVITY_W) * T, np.array(GRAVITY_W) * S
-    (q, p, v), (q_true, p_true, v_true) = ((poses.q_wb_wxyz, poses.p_wb, np.asarray(poses.v_w)) for poses in (path, truth))
-    q_c = quaternion.multiply(q_true[first], quaternion.inverse(q[first]))
-    faster = v_true[first] - v_true[last] + g_T + quaternion.rotate(q_c, v[last] - v[first] - g_T)
+    q_wxyz, q_true_wxyz = path.q_wb_wxyz, truth.q_wb_wxyz
+    (p, v), (p_true, v_true) = ((poses.p_wb, np.asarray(poses.v_w)) for poses in (path, truth))
+    q_c_wxyz = quaternion.multiply(q_true_wxyz[first], quaternion.inverse(q_wxyz[first]))
+    faster = v_true[first] - v_true[last] + g_T + quaternion.rotate(q_c_wxyz, v[last] - v[first] - g_T)
     further = p_true[first] - p_true[last] + v_true[first] * T + g_S
-    further += quaternion.rotate(q_c, p[last] - p[first] - v[first] * T - g_S)
-    turned = quaternion.angle_between(quaternion.multiply(q_c, q[last]), q_true[last])
+    further += quaternion.rotate(q_c_wxyz, p[last] - p[first] - v[first] * T - g_S)
+    turned = quaternion.angle_between(quaternion.multiply(q_c_wxyz, q_wxyz[last]), q_true_wxyz[last])
     return Drift(turned, quaternion.length(faster), quaternion.length(further))
 
 

@@ -6,9 +6,12 @@ with the order of the samples, and the samples that came too early.
 
 from __future__ import annotations
 
+import tempfile
+import weakref
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
+from typing import BinaryIO
 
 import numpy as np
 
@@ -17,10 +20,9 @@ from imutool.cleaning import raw_batches
 from imutool.cleaning.rules.gaps import missing
 from imutool.cleaning.rules.not_finite import measured
 from imutool.cleaning.rules.saturation import AxisLimits
-from imutool.cleaning.samples import BlockCutter, FrameCounts, Samples, batches_by_topic, blocks, joined
+from imutool.cleaning.samples import BLOCK, BlockCutter, FrameCounts, Samples, batches_by_topic, blocks, joined
 from imutool.cleaning.stamp_line import Stamps, distinct, read_stamps, restamped, usual_period
 from imutool.log_info.clock import IncreasingStamps, SensorStamps, sorted_stamps
-from imutool.log_info.kept_blocks import KeptBlocks
 from imutool.log_info.report import Interval
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
@@ -35,6 +37,9 @@ ROUNDING_NS = 1024  # of times as floats
 READ_AT_ONCE = 8  # IMUs: a quarter of a megabyte of messages of each waits to be decoded
 MARGIN = TICK_SPAN + 1  # stamps on both sides that show whether a step lost samples
 NO_FAULTS = Stamps(np.zeros(0, np.int64), "", Counter(), 1.0, unset=False)
+ROW_BYTES = 64  # of a sample: two times and six values; its message has some 350
+MAX_KEPT_ROWS = 1 << 21  # 128 MiB, three hours at 200 Hz: a folder of temporary files may lie in memory
+LAST_NS = 2**63 - 1
 
 
 class ImuSamples:
@@ -220,3 +225,47 @@ def _ordered_by(log_ns: Int64[np.ndarray, " n"], t_ns: Int64[np.ndarray, " n"]) 
     short = median(forward) / 2.0
     closer = int((steps < short).sum()) > int((forward < short).sum())
     return int(steps.min()) >= 0 and not closer and not clock_jumps(np.sort(t_ns))
+
+
+class KeptBlocks:
+    """Blocks of samples in a file without a name.
+
+    Of more than `MAX_KEPT_ROWS` samples, or where the system gives no file or no room, nothing is kept.
+    """
+
+    def __init__(self) -> None:
+        self._file: BinaryIO | None = None
+        self._rows = 0
+
+    def add(self, samples: Samples) -> None:
+        """Keep the next block; each but the last has `BLOCK` samples."""
+        table = np.column_stack([samples.log_ns, samples.stamp_ns, samples.values.view(np.int64)])
+        is_first, self._rows = not self._rows, self._rows + len(table)
+        try:
+            if is_first:
+                self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  closed with this object
+                weakref.finalize(self, self._file.close)
+            if self._file is not None and (self._rows > MAX_KEPT_ROWS or self._file.write(table.tobytes()) != table.nbytes):
+                self._drop()
+        except OSError:
+            self._drop()
+
+    def _drop(self) -> None:
+        if self._file is not None:
+            self._file.close()
+        self._file = None
+
+    def read(self, start_ns: int | None, end_ns: int | None) -> Iterator[Samples] | None:
+        """The samples with log times from `start_ns` to `end_ns`, both included; None where they are not kept."""
+        ends = 0 if start_ns is None else start_ns, LAST_NS if end_ns is None else end_ns
+        return None if self._file is None else self._within(self._file, *ends)
+
+    def _within(self, file: BinaryIO, start_ns: int, end_ns: int) -> Iterator[Samples]:
+        for first in range(0, self._rows, BLOCK):
+            file.seek(first * ROW_BYTES)
+            table = np.frombuffer(file.read(min(BLOCK, self._rows - first) * ROW_BYTES), np.int64).reshape(-1, 8)
+            log_ns, stamp_ns, values = table[:, 0].copy(), table[:, 1].copy(), table[:, 2:].copy().view(np.float64)
+            samples = Samples(first + np.arange(len(table)), log_ns, stamp_ns, values)
+            inside = (log_ns >= start_ns) & (log_ns <= end_ns)
+            if inside.any():
+                yield samples if inside.all() else samples.where(inside)

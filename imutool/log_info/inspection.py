@@ -167,16 +167,18 @@ def _imu(
     of_motion = [*motion.constant_sensors(), *convention_warnings(whole)] if len(imu) else ["no samples"]
     of_stuck = [f"{finding.count} {finding.what}" for finding in stuck.findings(whole) if finding.action == "dropped"]
     of_motion = of_motion or lean_warnings(motion, whole)
+    reflected = topic.reflected if isinstance(topic.reflected, Reflected) else None
+    of_fields = [reflected.compensated] if reflected and reflected.compensated else []
     misread = any(entry.subject == QUATERNIONS for entry in found)  # such poses turn as no body does
     return ImuInfo(
         topic=topic.name,
-        warnings=[*_imu_warnings(imu), *of_stuck, *of_motion],
+        warnings=[*_imu_warnings(imu), *of_stuck, *of_motion, *of_fields],
         conventions=found if len(imu) else UNSET,
         derived_from=derived_from,
         time=used,
         other_times=others,
         time_unit=unit,
-        stated_units=topic.reflected.units or UNSET if isinstance(topic.reflected, Reflected) else UNSET,
+        stated_units=(reflected.units if reflected else "") or UNSET,
         samples=imu.recorded.count,
         **imu.recorded.clock()._asdict(),
         **imu.counts,

@@ -212,9 +212,9 @@ def sparse_warnings(poses: Truth) -> list[str]:
     middle = np.flatnonzero(t_s[2:] - t_s[:-2] < GAP_FACTOR * period_s) + 1
     if period_s < SPARSE_S or len(middle) < FEWEST_BETWEEN:
         return []
-    q, share = quaternion.unit(poses.q_wb_wxyz), (t_s[middle] - t_s[middle - 1]) / (t_s[middle + 1] - t_s[middle - 1])
-    between = quaternion.slerp(q[middle - 1], q[middle + 1], share)
-    missed_deg = float(np.degrees(quantile(quaternion.angle_between(between, q[middle]), OFTEN))) / 4.0
+    q_wxyz, share = quaternion.unit(poses.q_wb_wxyz), (t_s[middle] - t_s[middle - 1]) / (t_s[middle + 1] - t_s[middle - 1])
+    between = quaternion.slerp(q_wxyz[middle - 1], q_wxyz[middle + 1], share)
+    missed_deg = float(np.degrees(quantile(quaternion.angle_between(between, q_wxyz[middle]), OFTEN))) / 4.0
     if missed_deg < MAX_BETWEEN_DEG:
         return []
     what = (

@@ -144,9 +144,9 @@ def _dead_reckoned(log: Log, name: str, imu: Imu) -> Poses:
     if len(t_ns) < 2:
         raise DataError(f"{name} has {len(t_ns)} twists while the IMU measures", expected="two or more")
     dt = np.diff(seconds(t_ns, int(t_ns[0])), prepend=0.0)
-    q = quaternion.exp(np.cumsum(dt * values[:, 3])[:, None] * np.array([0.0, 0.0, 1.0]))
-    v = quaternion.rotate(q, values[:, :3])
-    return Poses(t_ns, np.cumsum(dt[:, None] * v, axis=0), q, v)
+    q_wxyz = quaternion.exp(np.cumsum(dt * values[:, 3])[:, None] * np.array([0.0, 0.0, 1.0]))
+    v = quaternion.rotate(q_wxyz, values[:, :3])
+    return Poses(t_ns, np.cumsum(dt[:, None] * v, axis=0), q_wxyz, v)
 
 
 def _same_path(poses: Poses, truth: Poses) -> bool:

@@ -122,11 +122,11 @@ def _in_windows(values: Float64[np.ndarray, "c 3"]) -> Float64[np.ndarray, "w k 
 
 def _turned_back(rate: Float64[np.ndarray, "w k 3"], force: Float64[np.ndarray, "w k 3"]) -> Float64[np.ndarray, " w"]:
     """Length of the mean specific force of each window in the frame of its first sample."""
-    q = np.tile([1.0, 0.0, 0.0, 0.0], (len(rate), 1))
+    q_wxyz = np.tile([1.0, 0.0, 0.0, 0.0], (len(rate), 1))
     total = np.zeros((len(rate), 3))
     for k in range(rate.shape[1]):
-        total += quaternion.rotate(q, force[:, k])
-        q = quaternion.multiply(q, quaternion.exp(rate[:, k] * TURN_S))
+        total += quaternion.rotate(q_wxyz, force[:, k])
+        q_wxyz = quaternion.multiply(q_wxyz, quaternion.exp(rate[:, k] * TURN_S))
     return np.asarray(quaternion.length(total) / rate.shape[1])
 
 

@@ -288,8 +288,8 @@ def _without_imu(log: Log, truth: str | None) -> Recording:
         listed = ", ".join(f"{topic}/{child}" for child in frames) or "(none)"
         raise LogError(f"{len(frames)} bodies on {name}", where=log.path, expected="one", fix=f"Choose `truth` out of {listed}")
     (parts,) = frames.values()
-    t_ns, p_wb, q_wb = (np.concatenate([part[k] for part in parts]) for k in (3, 4, 5))
+    t_ns, p_wb, q_wb_wxyz = (np.concatenate([part[k] for part in parts]) for k in (3, 4, 5))
     with log.named(topic):
-        poses = Poses(t_ns, p_wb, unit_quaternions(q_wb))
+        poses = Poses(t_ns, p_wb, unit_quaternions(q_wb_wxyz))
     none = Imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
     return Recording(name=log.path.stem, imu=none, truths={name: poses})

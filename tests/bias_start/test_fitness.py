@@ -61,7 +61,7 @@ def test_the_sensor_itself_fits(model: BiasModel, recording: Recording) -> None:
     assert judged(model, recording.imu, MADE_FOR).verdict == "fits"
     given = judge(static.Model(), from_numbers("0,0,0,0,0,0"), [], {})
     assert given.verdict == "fits"
-    assert "at rest" not in given.reasons[0]
+    assert given.reasons[0] == "the log has no stop that could contradict its bias"
 
 
 @pytest.mark.parametrize("arm_m", [-1.0, 1.0])
@@ -235,6 +235,7 @@ def test_a_start_that_the_log_contradicts_is_named(untrained: bool, model: BiasM
         found = judge(static.Model() if untrained else model, start, [relative_samples(recording.imu)], MADE_FOR)
         assert found.verdict == verdict
         assert ("the start's bias of the gyro about " in found.reasons[0]) == (verdict != "fits")
+        assert (found.reasons[0] == "its bias agrees with the gyro at rest") == (untrained and verdict == "fits")
 
 
 def test_another_switching_on_is_no_doubt_where_gravity_confirms_the_correction(model: BiasModel, scaled: Imu) -> None:

@@ -112,6 +112,13 @@ def test_what_several_logs_in_a_row_have_alike_is_printed_once(capsys: pytest.Ca
     ]
 
 
+def test_the_warnings_of_a_log_that_is_read_twice_are_printed_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with terminal.progress("Reading", verbose=False, quiet=False):
+        for text in ("one is lost", "two are lost") * 2:
+            terminal.logger.warning("a: %s", text)
+    assert capsys.readouterr().err.splitlines() == ["warning: a: one is lost", "warning: a: two are lost"]
+
+
 def test_a_question_needs_no_full_stop() -> None:
     assert str(errors.ConfigError("a", fix="Did you mean b?")) == "a. Did you mean b?"
     assert str(errors.ConfigError("a", fix="Do b")) == "a. Do b."

@@ -26,7 +26,7 @@ from support.digests import digests
 from support.forked import Forked
 from support.processes import soon
 
-from imutool.cli.app import _Commands
+from imutool.cli.app import _Commands, caught
 from imutool.cli.demo import write_asl
 from imutool.errors import ConfigError
 from imutool.mcap_io.log import Log
@@ -278,6 +278,21 @@ def test_ctrl_c_before_a_command_begins(tmp_path: Path) -> None:
     _, stderr = run.communicate(timeout=WAIT_S)
     assert run.returncode == INTERRUPTED
     assert stderr.splitlines() == ["error: interrupted. Nothing half-written is left."]
+
+
+def test_a_second_ctrl_c_that_cuts_the_clean_up_short_does_not_end_in_a_promise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted() -> None:
+        with caught(), Target(tmp_path / "out.json") as target:
+            target.write(b"{")
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Target, "abandon", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(SystemExit):
+        interrupted()
+    assert len(partials(tmp_path)) == 1
+    assert "error: interrupted. A file of the name *.partial may be left; " in capsys.readouterr().err
 
 
 # ── a full disk, a locked folder ──

@@ -450,7 +450,7 @@ def test_a_right_log_stays_as_it_is(made: Recording, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("read_g", "kept"), [(1.0, []), (0.55, ["log.mcap: /imu0: the unit of accel is unknown: it reads 0.55"])]
+    ("read_g", "kept"), [(1.0, []), (0.55, ["log.mcap: /imu0: accel reads 0.55 when calm, gravity is 9.81 m/s^2"])]
 )
 def test_a_log_at_rest_in_g_and_steps_of_a_register_comes_in_radians(
     read_g: float, kept: list[str], made: Recording, tmp_path: Path
@@ -465,7 +465,16 @@ def test_a_log_at_rest_in_g_and_steps_of_a_register_comes_in_radians(
     fixed = read(tmp_path / "log.mcap").imu
     np.testing.assert_allclose(fixed.gyro, np.deg2rad(dps), rtol=1e-9)
     np.testing.assert_allclose(fixed.accel, forces * (1.0 if kept else 9.80665), rtol=1e-9)
-    assert [note.removesuffix(", which stays") for note in report.notes[1:]] == kept
+    assert [note.removesuffix("; its unit stays") for note in report.notes[1:]] == kept
+
+
+def test_a_log_in_g_without_a_calm_second_says_why_its_unit_stays(made: Recording, tmp_path: Path) -> None:
+    """Accelerations without gravity read as much."""
+    shaken = made.imu.accel + 4.0 * np.sin(np.arange(len(made.imu)) / 10.0)[:, None]
+    write(Recording("shaken", replace(made.imu, accel=shaken / 9.80665)), tmp_path / "shaken.mcap")
+    (note, *_) = convert(tmp_path / "shaken.mcap", tmp_path / "log.mcap", fix=True).notes
+    assert "accel looks like g, not m/s^2" in note
+    assert note.endswith("no second is calm enough to be sure; its unit stays")
 
 
 def test_batched_stamps_are_put_on_the_sensors_line(made: Recording, tmp_path: Path) -> None:

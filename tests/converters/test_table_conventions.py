@@ -46,6 +46,44 @@ def test_millidegrees_and_axes_behind_a_capital_are_known(tmp_path, time):
     np.testing.assert_allclose(imu.accel, ACCEL, rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("compensated", "raw"),
+    [
+        (
+            ("IMU::AngularRate::{} [rad/s]", "IMU::Accel::{} [m/s^2]"),
+            ("IMU::UncompGyro::{} [rad/s]", "IMU::UncompAccel::{} [m/s^2]"),
+        ),
+        (("angularrate.{}", "accel.{}"), ("imu_rate.{}", "imu_accel.{}")),
+        (("Gyro{}", "Acc{}"), ("UnCompGyro{}", "UnCompAcc{}")),
+        (("gyro_comp_{} [rad/s]", "accel_comp_{}"), ("gyro_uncomp_{} [rad/s]", "accel_uncomp_{}")),
+    ],
+)
+def test_uncompensated_columns_are_taken_and_compensated_ones_alone_are_named(tmp_path, compensated, raw):
+    """A VectorNav has removed the biases that it knows; with both in a table `convert` asked, or took these."""
+
+    def read(*names):
+        columns = {name: (GYRO.T, ACCEL.T) if name in raw else (GYRO.T - 0.01, ACCEL.T - 0.1) for name in names}
+        axes = {
+            name.format("XYZ"[k]): sensor[k]
+            for name, pair in columns.items()
+            for sensor in [pair[_is_accel(name)]]
+            for k in range(3)
+        }
+        path = write_csv(tmp_path / "vn.csv", ["TimeStartup", *axes], [T_NS - START_NS + 5_000_000_000, *axes.values()])
+        (tmp_path / "map.toml").write_text('gyro_unit = "rad/s"\n')
+        return table.read_sequence(table.sequences(path)[0], mapping=tmp_path / "map.toml")
+
+    both, alone = read(*compensated, *raw), read(*compensated)
+    np.testing.assert_allclose(both.imus["/imu0"].gyro, GYRO, rtol=1e-12)
+    np.testing.assert_allclose(both.imus["/imu0"].accel, ACCEL, rtol=1e-12)
+    said = [any("compensated: the filter in the sensor" in note for note in log.remarks.notes) for log in (both, alone)]
+    assert said == [False, True]
+
+
+def _is_accel(name):
+    return "acc" in name.lower()
+
+
 @pytest.mark.parametrize("stamp", ["set", "never set"])
 def test_the_stamp_of_a_message_counts_before_the_time_of_its_arrival(tmp_path, stamp):
     late_ns = T_NS + RNG.integers(0, 3_000_000, COUNT)

@@ -13,6 +13,7 @@ import pytest
 from imutool.converters import table
 from imutool.converters._tables.files.json_documents import load_json
 from imutool.converters._tables.text.delimited import Columns
+from imutool.converters._tables.text.names import topic_of
 from imutool.errors import ConfigError, DataError
 from imutool.recording.message_log import MessageLog
 
@@ -233,8 +234,15 @@ def test_signals_of_a_bus_have_their_own_times(tmp_path, late):
     assert np.array_equal(log.imus["/imu0"].t_ns, 1000 * (t_us + late)[:count])
     np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO[:count])
     np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL[:count])
-    (speed,) = (scalars for topic, scalars in log.scalars.items() if "speed" in topic)
-    assert np.array_equal(speed.t_ns, 1000 * (t_us + 777))
+    assert np.array_equal(log.scalars["/vehicle_speed"].t_ns, 1000 * (t_us + 777))
+    gyro, accel = ("angular_velocity_omega", "acceleration") if late else ("signals", "signals")  # not another sensor's name
+    assert any(f"gyro = {gyro}/angular_velocity_omega_x, " in note for note in log.remarks.notes)
+    assert any(f"accel = {accel}/acceleration_x, " in note for note in log.remarks.notes)
+
+
+def test_a_topic_does_not_repeat_its_group():
+    columns = "speed/speed", "speed/speed_left", "a/accel_x", "mocap/v [m/s]"
+    assert [topic_of(column, {}, []) for column in columns] == ["/speed", "/speed_left", "/a_accel_x", "/mocap_v_m_s"]
 
 
 @pytest.mark.parametrize(("unit", "more"), [({"per": "s"}, []), (7, []), ("rad/s", [0.5])])

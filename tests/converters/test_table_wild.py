@@ -248,7 +248,9 @@ def test_sentences_of_a_vectornav_lack_a_time_alone(tmp_path, sentence):
     with pytest.raises(ConfigError) as refused:
         read(tmp_path / "vn.txt")
     assert 'gyro_unit = "rad/s"' in str(refused.value.fix)
-    imu = table.read_sequence(table.sequences(tmp_path / "vn.txt")[0], mapping=tmp_path / "map.toml").imus["/imu0"]
+    log = table.read_sequence(table.sequences(tmp_path / "vn.txt")[0], mapping=tmp_path / "map.toml")
+    assert any("compensated" in note for note in log.remarks.notes) == (sentence != "VNIMU")
+    imu = log.imus["/imu0"]
     np.testing.assert_allclose(imu.gyro, 0.01 * COUNTS, atol=1e-4)
     np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, atol=1e-4)
 

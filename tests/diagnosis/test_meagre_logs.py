@@ -213,7 +213,12 @@ def test_poses_too_slow_to_be_differentiated_leave_what_samples_show_by_themselv
     assert "Only the checks of stamps and digits were possible" in said
     assert {"lever_arm", "gyro_scale", "clock_offset"} <= set(d.not_identifiable)
     assert to_physics_file(d).bias is None  # nobody knows it
-    assert json_values(d.report)["bias"] == {"gyro": None, "accel": None}
+    told = json_values(d.report)
+    assert told["bias"] == {"gyro": None, "accel": None}
+    assert (told["mismatch"], told["unexplained"]["white"]) == (None, None)  # a script may not read that the two agree
+    clipped = diagnose([moving(tmp_path, {}, poses_s=planted.clock(rate_hz=5.0), limit=np.full(6, 1.0), name="clipped").real])
+    assert effects(clipped) == ["saturation"]
+    assert conclusion(clipped).split(".")[0].endswith("; nothing else could be compared")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from mcap.writer import Writer
 from support.imu_defects import batch_of, late, pick, repeated, with_values, write_log
 
-from imutool.log_info import clock, kept_blocks
+from imutool.log_info import clock, imu_samples
 from imutool.log_info.imu_samples import ImuSamples
 from imutool.log_info.inspection import inspect
 from imutool.log_info.report import Interval
@@ -113,9 +113,9 @@ def test_a_chunk_is_unpacked_once_for_all_imus(tmp_path: Path, monkeypatch: pyte
     found = inspect(tmp_path / "log.mcap")
     with Log(tmp_path / "log.mcap") as log:
         assert count[0] == 2 * len(log.index.blocks)  # to check it, and to read the IMUs; it was 7
-    monkeypatch.setattr(kept_blocks, "MAX_ROWS", 1)
+    monkeypatch.setattr(imu_samples, "MAX_KEPT_ROWS", 1)
     assert inspect(tmp_path / "log.mcap") == found, "of many samples the log is read again"
-    monkeypatch.setattr(kept_blocks.tempfile, "TemporaryFile", no_file)
+    monkeypatch.setattr(imu_samples.tempfile, "TemporaryFile", no_file)
     assert inspect(tmp_path / "log.mcap") == found, "without a temporary file the log is read again"
     assert count[0] > 4 * len(log.index.blocks)
     assert [imu.samples for imu in found.imu] == [10_000] * 3

@@ -471,6 +471,10 @@ def test_an_imu_whose_definition_has_another_order_is_read_in_its_own(tmp_path: 
         ("cbor", "Messages in cbor are not searched for an IMU: record them as"),
         ("msgpack", "A message in msgpack is an IMU if its fields are named as"),
         ("protobuf", "A message in protobuf is an IMU if its fields are named as"),  # which is installed
+        (
+            "json",
+            "A message in json is an IMU .*; messages of several samples each are read from a file, one JSON",
+        ),
     ],
 )
 def test_a_log_without_an_imu_says_how_messages_are_searched(tmp_path: Path, encoding: str, hint: str) -> None:

@@ -17,6 +17,7 @@ from ..text.names import (
     SI_WORDS,
     WITHOUT_GRAVITY,
     group_of,
+    is_compensated,
     leaf_of,
     name_and_unit,
     spaced_name,
@@ -73,6 +74,9 @@ def propose(columns: Columns, given: Entries = NOTHING) -> Proposal:
         _propose_gyro_unit(proposal, columns, given)
     if not proposal.entries.keys() & {"gyro", "accel"}:
         proposal.hints += perhaps(columns)
+    time = str(proposal.entries.get("time", ""))
+    if any(is_compensated(column, time) for sensor in sensors for column in proposal.entries.get(sensor, [])):
+        proposal.reasons.append("the columns are compensated: the filter in the sensor has removed the biases that it knows")
     accel = proposal.entries.get("accel", [""])
     if "accel" not in given and re.match(CORE_MOTION, spaced_name(accel[0])):
         proposal.entries["accel"] = [f"-{column}" for column in accel]

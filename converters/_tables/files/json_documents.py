@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
+from os.path import commonprefix
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,9 @@ def _without_signals(document: Any, columns: Columns) -> Any:
         group.add("time", times)
         group.add(name, values, node["unit"] or "")
     for group in groups.values():
-        columns.take([*group.values][1], group, ", ".join([*group.values][1:]))
+        names = [*group.values][1:]
+        shared = commonprefix([f"{name}_" for name in names]).rpartition("_")[0] or "signals"  # noqa: RUF071  # no paths
+        columns.take(shared if shared not in columns.sources else f"{shared}{len(columns.sources)}", group, ", ".join(names))
     return {name: node for name, node in document.items() if name not in found} if found else document
 
 

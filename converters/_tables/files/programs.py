@@ -34,7 +34,8 @@ def of_vectornav(text: str, columns: Columns) -> str:
         return ""
     lines = [line for line in text.splitlines() if line.strip()]
     rows = [line.partition("*")[0].partition(",")[2] for line in lines if line.startswith(match[0])]
-    columns.remarks.notes.append(f"the sentences {match[1]} of a VectorNav sensor")
+    compensated = "" if match[1] == "VNIMU" else ", compensated: the filter in the sensor has removed the biases that it knows"
+    columns.remarks.notes.append(f"the sentences {match[1]} of a VectorNav sensor{compensated}")
     if len(rows) < len(lines):
         columns.remarks.losses.append(f"{len(lines) - len(rows)} lines of other sentences are left out")
     return "\n".join([",".join(SENTENCES[match[1]]), *rows]) + "\n"

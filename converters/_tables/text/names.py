@@ -69,12 +69,13 @@ BIAS = r"(^|_)bias(es)?_(?!corr|comp|free|remov)"  # in front of the name of a s
 IN_FRAMES = r"(?<![pqrv]_[a-z]{2}_)"  # p_WS_W is a position, in a frame W
 WORDS = {
     "gyro": rf"gyro(scope)?s?|gyro_?rotation|gyroskop|gyr|gy|omega|{IN_FRAMES}w|(?<![pqrvc]_)wb|{UNBIASED}g"
-    rf"|angular_?velocity|ang_?vel|(rotation_?)?rate|rate_of_rotation|{UNBIASED}w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?|gyro_?adc|gyro_rad",
+    rf"|angular_?velocity|ang_?vel|((rotation|angular)_?)?rate|rate_of_rotation|{UNBIASED}w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?|gyro_?adc|gyro_rad",
     "accel": rf"accel((eration|erometer)s?)?|acc[el]?|ac|{IN_FRAMES}{UNBIASED}a|fb|g_?force|gf|linear_?acceleration"
     rf"|specific_?force|sp_?force|(linear)?beschleunigung|{UNBIASED}a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
 }
 STATES = (  # of the numbers in a column
-    r"_(sensor|raw|deg(rees?)?|rad(ians?)?|adc|counts?|(un)?cal(ib)?(rated)?|data|values?|readings?|meas(ured)?|(non_?)?wake_?up)"
+    r"_(sensor|raw|deg(rees?)?|rad(ians?)?|adc|counts?|(un)?cal(ib)?(rated)?|data|values?|readings?|meas(ured)?|(non_?)?wake_?up"
+    r"|(un_?)?comp(ensated)?)"
 )
 STATE = rf"(?P<state>({STATES})?)"
 PLACES = (  # of several IMUs on a body
@@ -102,6 +103,9 @@ RECORDINGS = (  # columns whose values tell recordings apart
     r"|series|flight|source_?file|file"
 )
 SENSORS = r"sensor|device|imu|node|placement|body_?(part|segment|location)|limb|(sensor|device|imu)_?(position|location)"
+UNCOMPENSATED = r"(^|_)un_?comp(ensated)?(_|$)"  # by the filter in a sensor, which removes the biases that it knows
+COMPENSATED = r"(^|_)comp(ensated)?(_|$)|(^|_)angularrate_"  # the second of VectorNav's messages
+VECTORNAV_RAW = rf"{UNCOMPENSATED}|(^|_)imu_(rate|accel)_[xyz]$"
 CHINESE = {"加速度": "acc_", "角速度": "gyro_", "时间": "time"}  # of WitMotion's program
 AXES = {"0": "x", "1": "y", "2": "z"}
 TURNS = AXES | {"roll": "x", "pitch": "y", "yaw": "z", "p": "x", "q": "y", "r": "z"}
@@ -110,10 +114,19 @@ TURNS = AXES | {"roll": "x", "pitch": "y", "yaw": "z", "p": "x", "q": "y", "r": 
 def triples(sensor: str, *names: dict[str, str]) -> dict[str, dict[str, str]]:
     """Columns of three axes by what they are of, in the first form of names that has all three.
 
-    `names` are spellings of the columns' names; `left_gyr_x` is of `left`, `gx2` of `imu2`.
+    `names` are spellings of the columns' names; `left_gyr_x` is of `left`, `gx2` of `imu2`. Uncompensated ones come alone.
     """
     tries = (_triples(sensor, spelled, form) for form in FORMS for spelled in names)
-    return next(filter(None, tries), {}) or _symbols(sensor, names[0])
+    found = next(filter(None, tries), {}) or _symbols(sensor, names[0])
+    of_vectornav = any(name.endswith("imu_rate_x") for name in names[0].values())
+    raw = VECTORNAV_RAW if of_vectornav else UNCOMPENSATED
+    return {owner: axes for owner, axes in found.items() if re.search(raw, spaced_name(axes["x"]))} or found
+
+
+def is_compensated(column: str, time: str) -> bool:
+    """Whether the filter in the sensor has corrected a column, by its name or VectorNav's time."""
+    name, of_vectornav = spaced_name(column), spaced_name(time) == "time_startup"
+    return re.search(COMPENSATED, name) is not None or (of_vectornav and re.search(VECTORNAV_RAW, name) is None)
 
 
 def _symbols(sensor: str, columns: Iterable[str]) -> dict[str, dict[str, str]]:
@@ -228,6 +241,7 @@ def split_name(column: str) -> tuple[str, str]:
     text = column.strip().lower().translate(SAME_MARKS)
     for words, translated in CHINESE.items():
         text = text.replace(words, translated)
+    text = re.sub(r"(?<=uncomp)(?=gyro|acc)|(?<=imu)(?=rate|accel)", "_", text)
     bracket = re.search(r"[\[(]([^\])]*[a-zµ°][^\])]*)[\])]\s*$", text)
     unit = next((u for u, p in UNITS.items() if bracket and re.fullmatch(rf"(in )?({p})", bracket[1].strip())), "")
     if bracket:
@@ -270,7 +284,9 @@ def distinct_names(names: list[str]) -> list[str]:
 
 def topic_of(column: str, taken: Collection[str], notes: list[str]) -> str:
     """Topic of a column in Latin letters; a note where it does not show the column."""
-    name = re.sub(r"[^A-Za-z0-9_]+", "_", column).strip("_") or "column"
+    leaf = leaf_of(column)
+    distinct = leaf if f"{leaf}_".startswith(f"{group_of(column)}_") else column  # of speed/speed_left: speed_left
+    name = re.sub(r"[^A-Za-z0-9_]+", "_", distinct).strip("_") or "column"
     topic = f"/{name}" if name[0].isalpha() else f"/column_{name}"
     if topic in taken or topic == "/column":  # of a name that differs by marks, or is in other letters
         while topic in taken:

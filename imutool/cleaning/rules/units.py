@@ -47,7 +47,8 @@ class Units(Rule):
             values |= {"factor": factor, "fix": f"accel from {unit}"}
             yield Finding("units", "warning", what, 3, values=values, action="converted", confidence=0.98)
         elif unit:
-            what = f"accel looks like {unit}, not m/s^2: it reads {level:.4g}{' when calm' if at_rest else ''}"
+            when = "when calm" if at_rest else "in motion, and no second is calm enough to be sure"
+            what = f"accel looks like {unit}, not m/s^2: it reads {level:.4g} {when}"
             values |= {"fix": f"accel from {unit}"} if at_rest else {}
             yield Finding("units", "error", what, 3, values=values, confidence=0.7, distrust=f"accel may be in {unit}")
         elif level < FREE_OF_GRAVITY_M_S2:

@@ -66,8 +66,8 @@ def _with_z_up(real: Recording) -> Recording:
     if up not in TO_Z_UP:
         return real
     turn, (topic, poses) = TO_Z_UP[up], next(iter(real.truths.items()))
-    q_wb = quaternion.multiply(quaternion.of_matrix(turn), poses.q_wb_wxyz)
-    turned = Poses(poses.t_ns, poses.p_wb @ turn.T, q_wb, None if poses.v_w is None else poses.v_w @ turn.T)
+    q_wb_wxyz = quaternion.multiply(quaternion.of_matrix(turn), poses.q_wb_wxyz)
+    turned = Poses(poses.t_ns, poses.p_wb @ turn.T, q_wb_wxyz, None if poses.v_w is None else poses.v_w @ turn.T)
     return replace(real, truths={**real.truths, topic: turned})
 
 

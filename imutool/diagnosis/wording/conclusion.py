@@ -48,6 +48,8 @@ def headline(d: Diagnosis) -> str:
     parts = [_only_finding(d) if len(d.findings) == 1 else _all_findings(d)] if d.findings else []
     if unnamed:
         parts.append(unnamed)
+    elif not d.unexplained:
+        parts.append("nothing else could be compared")
     elif all(_residual(d, signal) == QUIET for signal in d.unexplained):
         parts.append(QUIET)
     elif signals := [signal for signal, residual in d.unexplained.items() if not residual.white and not _rings(d, signal)]:

@@ -113,4 +113,6 @@ def unread_fix(encodings: Set[str], languages: Set[str]) -> str:
             return "An IMU in protobuf is read with: pip install 'imutool[protobuf]'"
     if not (named := sorted(BY_NAMES & encodings)):
         return ""
-    return f"A message in {' or '.join(named)} is an IMU if its fields are named as an angular velocity and an acceleration"
+    what = f"A message in {' or '.join(named)} is an IMU if its fields are named as an angular velocity and an acceleration"
+    batches = "messages of several samples each are read from a file, one JSON message a line, and not from MCAP"
+    return f"{what}; {batches}" if "json" in named else what

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from imutool.mcap_io.codec.formats import (
     MATRIX,
     STATED,
     TEXT,
+    UNCOMPENSATED,
     UNITS_NS,
     Format,
     Path,
@@ -38,6 +39,7 @@ from imutool.mcap_io.codec.formats import (
     beginning,
     counts_in,
     fields_of,
+    imu_in,
     stamp_parts,
     stamps_of,
     unit_in,
@@ -45,8 +47,7 @@ from imutool.mcap_io.codec.formats import (
     unit_ns,
     vector_in,
 )
-from imutool.mcap_io.codec.formats.flatbuffer import FlatBuffer
-from imutool.mcap_io.codec.formats.objects import OF_OBJECTS, Json
+from imutool.mcap_io.codec.formats.encodings import format_of, tree_of
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
 from imutool.mcap_io.codec.schemas import GYRO_COVARIANCE, IMU, POSE, runs
 from imutool.mcap_io.codec.transforms import TYPE, Transforms
@@ -57,6 +58,7 @@ POSE_TYPES = r"pose(?!s)|odom|truth|mocap|vicon|tracker"  # in the name of a typ
 FRAME = r"frame_?id|frame"
 LOG_TIME, WITHOUT_STAMP = "log time", "as the messages state no stamp with its unit"
 BY_LOG_TIMES = "as the log times show"
+BY_SENSOR = "the filter in the sensor has removed the biases that it knows"
 
 
 class Sample(NamedTuple):
@@ -83,16 +85,28 @@ class Reflected:
     counts: tuple[Path, ...] = ()  # times without a unit, in a message that states no stamp; the unit that log times show
     stamp_unit: str = ""
     pose: Reflected | None = None  # in the messages of an IMU
+    uncompensated: tuple[Path, ...] = ()  # six others like `vectors`, for which they are taken where filled in
 
     @property
     def stamp_path(self) -> str:
         """Field of the stamp; of several the one that holds them."""
         return ".".join(map(str, self.stamp[0][0][: len(self.stamp[0][0]) - (len(self.stamp) > 1)]))
 
+    @property
+    def compensated(self) -> str:
+        """Sentence on samples that the filter in the sensor has compensated; else empty."""
+        names = ", ".join(dict.fromkeys(".".join(map(str, path[:-1] or path)) for path in self.vectors))
+        return f"{names} are compensated: {BY_SENSOR}" if self.uncompensated else ""
+
     def settled(self, messages: Iterable[tuple[int, bytes]]) -> Reflected:
-        """Fields with the stamp whose unit the log times of the first messages show, where the message states none."""
-        first = beginning(messages) if self.counts and not self.stamp else []
-        for path in self.counts[: len(first)]:
+        """Fields that the first messages fill in, with the stamp whose unit their log times show where none is stated."""
+        counts = () if self.stamp else self.counts
+        first = beginning(messages) if counts or self.uncompensated else []
+        with suppress(*LACKS):
+            parsed = (self.format.parse(raw) for _, raw in first)
+            if any(self.format.at(message, path) for message in parsed for path in self.uncompensated):
+                return replace(self, vectors=self.uncompensated, uncompensated=()).settled(first)
+        for path in counts[: len(first)]:
             with suppress(*LACKS):
                 values = [self.format.at(self.format.parse(raw), path) for _, raw in first]
                 if unit := unit_ns(values, [log_time for log_time, _ in first]):
@@ -217,32 +231,6 @@ def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: b
     return _pose(tree, form) if re.search(POSE_TYPES, f"{topic} {schema_name}".lower()) else None
 
 
-def format_of(encoding: str, schema_name: str, schema: bytes) -> Any:
-    """Access to messages of a schema; None of an unknown encoding or a damaged schema.
-
-    Raises:
-        ImportError: the schema is of protobuf, which is not installed.
-    """
-    if encoding in OF_OBJECTS:
-        return OF_OBJECTS[encoding](schema)
-    if encoding == "flatbuffer":
-        return FlatBuffer.of(schema_name, schema)
-    if encoding != "protobuf":
-        return None
-    from imutool.mcap_io.codec.formats.protobuf import Protobuf
-
-    return Protobuf.of(schema_name, schema)
-
-
-def tree_of(form: Any, first: bytes) -> Any:
-    """Tree of the fields, by the schema or, of JSON and MessagePack, by the first message.
-
-    Raises:
-        ValueError: that is no message.
-    """
-    return form.tree(form.parse(first)) if isinstance(form, Json) else form.tree(DEPTH)
-
-
 def reflect_cdr(schema_name: str, schema: bytes, encoding: str = "cdr") -> Reflected | None:
     """Fields of an IMU in a definition of ROS; None of any other message."""
     try:
@@ -265,15 +253,11 @@ def _in_si(found: Reflected, form: Format) -> Reflected:
 def _found(tree: Tree, form: Format) -> Reflected | None:
     """Fields of an IMU in the tree of a message's fields."""
     fields = [*fields_of(tree)]
-    parts: dict[Path, list[tuple[Path, str, Any]]] = {}
-    for field in fields:
-        parts.setdefault(field[0][:-1], []).append(field)
-    long, short = (GYRO, ACCEL), ("[gw]", "a")  # short: ax, ay, az, gx, gy, gz
-    searched = *((part, long) for part in parts.values()), (fields, long), *((part, short) for part in parts.values())
-    pairs = ((part, vector_in(part, gyro), vector_in(part, accel)) for part, (gyro, accel) in searched)
-    part, gyro, accel = next((pair for pair in pairs if pair[1] and pair[2]), (fields, None, None))
-    if gyro is None or accel is None:
+    raw = imu_in(fields, *UNCOMPENSATED)
+    found = imu_in(fields, GYRO, ACCEL) or raw or imu_in(fields, "[gw]", "a", whole=False)  # ax, ay, az, gx, gy, gz
+    if found is None:
         return None
+    part, vectors = found
     frame = next((path for path, name, node in fields if node == TEXT and re.fullmatch(FRAME, name)), None)
     covariances = [
         next((path for path, name, node in part if node == MATRIX and re.fullmatch(rf"{pattern}_?covariance", name)), None)
@@ -281,7 +265,8 @@ def _found(tree: Tree, form: Format) -> Reflected | None:
     ]
     stamp, *others = [*stamps_of(fields)] or [()]
     unused, counts = tuple(other[0][0] for other in others), () if stamp else counts_in(fields)
-    return Reflected(IMU, form, (*gyro, *accel), stamp, frame, tuple(covariances), unused, counts=counts)
+    uncompensated = raw[1] if raw and raw != found else ()
+    return Reflected(IMU, form, vectors, stamp, frame, tuple(covariances), unused, counts=counts, uncompensated=uncompensated)
 
 
 def _pose(tree: Tree, form: Format) -> Reflected | None:

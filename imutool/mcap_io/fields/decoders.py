@@ -19,7 +19,7 @@ from imutool.array_types import Float64, Int64, UInt8
 from imutool.errors import LogError
 from imutool.mcap_io.codec import ros2_definition, schemas
 from imutool.mcap_io.codec.formats import LACKS, MAX_ROW, NumberFormat, Path, fields_of, stamps_of
-from imutool.mcap_io.codec.reflection import format_of, tree_of
+from imutool.mcap_io.codec.formats.encodings import format_of, tree_of
 from imutool.mcap_io.codec.ros2_definition import Definition, Leaf
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import REFLECTED, Topic

@@ -102,10 +102,10 @@ def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Erro
     unknown = 0.0 if truth.has_positions else np.nan
     for first in range(0, len(truth), quaternion.ROWS_AT_ONCE):
         rows = slice(first, first + quaternion.ROWS_AT_ONCE)
-        q, back = estimate.q_wb_wxyz[rows], quaternion.inverse(truth.q_wb_wxyz[rows])
+        q_wxyz, back = estimate.q_wb_wxyz[rows], quaternion.inverse(truth.q_wb_wxyz[rows])
         hole = np.where(valid[rows], 0.0, np.nan)[:, None]
-        turned[rows] = np.rad2deg(quaternion.log(quaternion.multiply(back, q))) + hole
-        roll_pitch_yaw[rows] = np.rad2deg(quaternion.roll_pitch_yaw(quaternion.multiply(q, back))) + hole
+        turned[rows] = np.rad2deg(quaternion.log(quaternion.multiply(back, q_wxyz))) + hole
+        roll_pitch_yaw[rows] = np.rad2deg(quaternion.roll_pitch_yaw(quaternion.multiply(q_wxyz, back))) + hole
         distance[rows] = estimate.p_wb[rows] - truth.p_wb[rows] + (hole + unknown)
     return Errors(estimate.t_ns, turned, roll_pitch_yaw, distance)
 

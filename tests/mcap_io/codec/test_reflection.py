@@ -154,6 +154,17 @@ def test_a_robot_counts_ticks_of_a_millisecond() -> None:
     assert struct.unpack("<6fI", settled.with_stamp(raw[3], 999_000_000)[4:])[-1] == 999
 
 
+@pytest.mark.parametrize("is_filled", [True, False])
+def test_samples_before_the_filter_in_the_sensor_are_taken_where_a_message_has_them(is_filled: bool) -> None:
+    """VectorNav's CommonGroup gave those from which its filter had removed the bias, without a word."""
+    vector = f"{'=' * 80}\nMSG: my_driver/V\nfloat64 x\nfloat64 y\nfloat64 z\n"
+    found = reflected(f"V angularrate\nV accel\nV imu_accel\nV imu_rate\n{vector}")
+    raw = b"\0\1\0\0" + struct.pack("<12d", *range(1, 7), *(is_filled * np.arange(7.0, 13.0)))
+    settled = found.settled([(START_NS, raw)])
+    assert list(settled.sample(raw, START_NS).values) == ([10, 11, 12, 7, 8, 9] if is_filled else [1, 2, 3, 4, 5, 6])
+    assert settled.compensated.startswith("angularrate, accel are compensated") != is_filled
+
+
 def test_a_position_in_a_driver_s_own_message_is_no_pose() -> None:
     """VectorNav's CommonGroup has latitude and longitude there."""
     vector = "float64 x\nfloat64 y\nfloat64 z\n"

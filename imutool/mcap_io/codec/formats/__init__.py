@@ -37,6 +37,10 @@ NAMED = {  # units behind these words, with their size in SI
     "accel": {r"_mg|_?milli_?gs?": MILLI_G, r"_gs?": G, r"_?(m_?s_?2|mps2|si)": M_S2},
 }
 GYRO, ACCEL = (f"{WORDS[sensor]}({'|'.join(NAMED[sensor])})?" for sensor in WORDS)
+UN = r"un_?comp(ensated)?"
+UNCOMPENSATED = [  # by the filter in the sensor, which removes the biases that it knows; `imu_rate` is of VectorNav
+    rf"{UN}_?{WORDS[sensor]}|{WORDS[sensor]}_?{UN}|{own}" for sensor, own in (("gyro", "imu_rate"), ("accel", "imu_accel"))
+]
 PER_S = r"[ _]?(/|\bper\b) ?s(ec(ond)?s?)?\b"
 STATED = {  # units in the comments of a definition
     "gyro": {
@@ -181,6 +185,23 @@ def vector_in(fields: Sequence[tuple[Path, str, Any]], pattern: str) -> tuple[Pa
         for axis in "xyz"
     )
     return None if x is None or y is None or z is None else (x, y, z)
+
+
+def imu_in(
+    fields: Sequence[tuple[Path, str, Any]], gyro: str, accel: str, *, whole: bool = True
+) -> tuple[Sequence[tuple[Path, str, Any]], tuple[Path, ...]] | None:
+    """Fields next to an IMU's rates and accelerations, and the paths of those six numbers.
+
+    With `whole` the two may also lie in different parts of the message.
+    """
+    parts: dict[Path, list[tuple[Path, str, Any]]] = {}
+    for field in fields:
+        parts.setdefault(field[0][:-1], []).append(field)
+    for part in (*parts.values(), *((fields,) if whole else ())):
+        rates, forces = vector_in(part, gyro), vector_in(part, accel)
+        if rates and forces:
+            return part, (*rates, *forces)
+    return None
 
 
 def refuse_long(raw: bytes) -> None:
