@@ -154,9 +154,10 @@ def tracked_in_motion(model: BiasModel, imu: Imu) -> InitialBias:
     Of another unit's log it is the bias that these samples show, smoothed.
     """
     first_ns = int(imu.t_ns[0]) if len(imu) else 0
-    before, samples = bias_prior(model, first_ns), model_samples(model, imu)
-    track, _, *shown = smooth_bias(model, [samples], before)
-    if (other := of_log(before, *shown, AT_REST_STD)) is before:
+    before, samples = bias_prior(model, first_ns), relative_samples(imu)
+    found = smooth_bias(model, [samples], before)
+    track, other = found.track, of_log(before, found.difference, found.variance, AT_REST_STD)
+    if other is before:
         return tracked_from_prior(model, first_ns)
     how = f"gravity in motion, as of another unit, {accuracy(track.std[0])}, then {TRACKED_BY}"
     return InitialBias(track.rest[0], track.std[0], how, track=track, follows=other, hold_s=float(samples[0][-1]))
