@@ -11,6 +11,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64, Rows6, Vectors
 from imutool.bias.model import BiasModel, Covariances, Vector6
 from imutool.bias.temperature import TemperatureFilter, celsius_of, channel_of, holding, scale_of
+from imutool.cleaning.likelihood import axis_names, signed_permutations
 from imutool.errors import ModelError
 from imutool.inertial.stationary import CALM, white_noise
 from imutool.mcap_io.temperature import EVERY_NS, is_temperature, thinned
@@ -29,6 +30,9 @@ MAX_NOISE = 4.0  # ratio to the residuals of the training logs; training logs up
 MAX_RATE = 0.01  # relative difference of rates: it changes a conv with random weights by 5 %, one that ships by nothing
 SURE = 3.0  # deviations of a median step
 MAX_BEYOND_K = 1.0  # beyond the trained range, before it counts as another one
+TURNED = 20.0  # chi-square that turned axes leave at most, and by which they are better
+MAX_LEFT = 0.2  # share of chi-square that turned axes leave; of sensors that were turned up to 0.16, by chance 0.28
+FEW_SESSIONS, MAX_LEFT_OF_FEW = 3, 0.12  # few say little of the next one; TUM-VI's turned sensor, of one session, leaves 0.11
 Stamps = Int64[np.ndarray, " n"]
 
 
@@ -80,6 +84,31 @@ def other_unit(model: BiasModel, about: Mapping[str, str]) -> Iterator[str]:
         own, other = model.card.get(key), about.get(key)
         if own and other and own != other:
             yield f"the model was made for the {words} {own}, the log is of {other}"
+
+
+def max_left(sessions: int) -> float:
+    """Share of chi-square that turned axes leave at most, by the known sessions."""
+    return MAX_LEFT_OF_FEW if 1 <= sessions <= FEW_SESSIONS else MAX_LEFT
+
+
+def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, max_left: float, *, confirmed: bool = False) -> list[str]:
+    """Sentence on a log whose bias is clearly that of the training logs in turned axes.
+
+    A correction of scales is the same in axes that are turned by half a turn, so the share of it says nothing about these. If
+    it is `confirmed`, there are no other turns. `max_left` is the share of chi-square that turned axes leave at most: less,
+    where few logs show how much the bias changes by itself.
+    """
+    rotations = signed_permutations()[np.linalg.det(signed_permutations()) > 0.0]  # the identity first
+    if confirmed:
+        rotations = rotations[(np.abs(rotations) == np.eye(3)).all(axis=(1, 2))]
+    turned = (rotations[:, None] @ mean.reshape(2, 3, 1)).reshape(-1, 6)
+    chi_square = (((mean + difference - turned) / std) ** 2).sum(axis=1)
+    best = int(np.argmin(chi_square))
+    if chi_square[best] > min(TURNED, max_left * chi_square[0]) or chi_square[0] - chi_square[best] < TURNED:
+        return []
+    return [
+        f"its bias is that of the training logs if its x, y, z are their {axis_names(rotations[best])}: the axes are turned"
+    ]
 
 
 class TemperatureDrift:

@@ -26,9 +26,10 @@ from imutool.bias_start.initial_bias import (
     relative_samples,
     smooth_bias,
     tracked_from_prior,
+    tracked_in_motion,
     training_source,
 )
-from imutool.bias_start.prior_width import MAX_DEVIATIONS, BiasPrior, supported_std, widened
+from imutool.bias_start.prior_width import MAX_DEVIATIONS, MAX_UNKNOWN, BiasPrior, supported_std, widened
 from imutool.errors import DataError
 from imutool.inertial.inertial_filter import MIN_FORCE_M_S2
 from imutool.inertial.innovations import MIN_DRIVEN_M_S, SURPRISING, innovations
@@ -38,7 +39,6 @@ from imutool.recording.columns import true_ranges
 
 LOOK_AHEAD_S = 60.0  # in which a log that begins in motion may stop: what the start of a command reads
 REST_BEGINS_WITHIN_S = 5.0  # a later stop would give a bias from the future
-MAX_UNKNOWN = 1e-3  # rad/s, deviation of a bias that may be left unknown: 3 degrees in a minute
 UNTRAINED = BiasPrior(np.zeros(6), np.full(6, np.inf), np.full(6, MAX_UNKNOWN))  # of the change from stop to stop
 UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sensor nobody calibrated (BMI160 of TUM-VI: 1.3)
 CLEAR = 0.01  # rad/s, of a bias by gravity in motion: a wrong unit's has 0.03, the own from 0.001 to 0.006
@@ -63,7 +63,7 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
     if not model.card and not (blocks and blocks[0].resting):
         raise _no_rest()
     if not blocks:
-        return tracked_from_prior(model, first_ns)
+        return tracked_in_motion(model, imu)
     begin_s, end_s = next(block.start_s for block in blocks if block.resting), blocks[-1].end_s
     t_s, gyro, accel = relative_samples(imu.rows(slice(0, int(np.searchsorted(imu.t_ns, first_ns + nanoseconds(end_s))))))
     u, at_stop = np.concatenate([gyro, accel], axis=1), t_s >= begin_s

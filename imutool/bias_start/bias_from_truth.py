@@ -13,7 +13,7 @@ import numpy as np
 
 from imutool.array_types import Bool, Float64, Int64, Rows6, Vectors
 from imutool.bias.model import Array, BiasModel, Vector6
-from imutool.bias_start.bias_at_rest import MAX_UNKNOWN, UNUSUAL, refuted_stops, rest_differences
+from imutool.bias_start.bias_at_rest import UNUSUAL, refuted_stops, rest_differences
 from imutool.bias_start.initial_bias import (
     MIN_STD,
     TRACKED_BY,
@@ -23,7 +23,7 @@ from imutool.bias_start.initial_bias import (
     prior,
     relative_samples,
 )
-from imutool.bias_start.prior_width import BiasPrior, supported_std
+from imutool.bias_start.prior_width import MAX_UNKNOWN, BiasPrior, supported_std
 from imutool.cleaning.rules.saturation import at_limit
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion

@@ -5,7 +5,8 @@ which ties the gyro to gravity. Under a model that fits, the innovations e of th
 chi-square with three degrees of freedom (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
 Navigation, 2001, sec. 5.4), and the bias that the log shows lies within the prior of the training logs. The innovations of the
 raw samples ask for the whole of the model's correction in motion (`imutool.inertial.innovations`), whatever bias a new
-switching-on gave; a log that asks for less than half is another unit's. A lever arm is no such correction.
+switching-on gave; a log that asks for less than half is another unit's. A lever arm is no such correction. A bias that the log
+does not show is believed where what it shows tells the unit.
 Where one of the three fails, the likelihood of the innovations is compared with that of the raw samples and an unknown constant
 bias: the model is unfit if even from its start in this log it explains the samples worse than no model, if the log asks for the
 opposite of its correction, or if its bias and its correction are both another unit's.
@@ -25,13 +26,12 @@ import numpy as np
 
 from imutool.bias import static
 from imutool.bias.hybrid import without_lever_arm
-from imutool.bias.log_binding import other_conditions, other_unit
+from imutool.bias.log_binding import max_left, other_conditions, other_unit, turned_axes
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias.model_file import library, shipped_for
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import (
     MAX_SURPRISING,
-    MAX_UNKNOWN,
     UNKNOWN_STD,
     UNTRAINED,
     changed_at_rest,
@@ -42,16 +42,17 @@ from imutool.bias_start.bias_at_rest import (
 from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_together, stops_of, without_motion
 from imutool.bias_start.initial_bias import AT_REST_STD, MIN_STD, InitialBias, bias_prior
 from imutool.bias_start.prior_width import (
+    DEPENDENT,
     MAX_CHANGE,
     MAX_DEVIATIONS,
+    MAX_UNKNOWN,
     TELLING,
     BiasPrior,
+    ShownBias,
     contradicted_start,
-    max_left,
     other_bias,
     supported_std,
-    turned_axes,
-    untold_bias,
+    untold_unit,
 )
 from imutool.bias_start.stretches import unusual_gravity
 from imutool.inertial.innovations import SURPRISING, Share, innovations, share_of_correction
@@ -60,7 +61,6 @@ CHECKED_S = 120.0  # of a log that the check reads
 MIN_SPEED_M_S, MIN_PIVOT_M = 1.0, 1e-3  # of the filter: an arm and a tight bound would take up what a wrong scale leaves
 MAX_OF_GUESS = np.array([3.0] * 3 + [MAX_DEVIATIONS] * 3)  # the same where few sessions leave the prior's width to a guess
 MIN_EVIDENCE = -40.0  # log-likelihood of the model against none
-DEPENDENT = 2.0  # ratio of the shown bias's deviation to the filter's, which takes velocities for independent; a hand circles
 ROOM_M = 8.0  # deviation of a position every half second, as if each were independent; as three metres for some seconds
 MAX_IN_ROOM = 0.45  # mean chi-square of three: 0.4 or less in rooms and halls, from 4 on in vehicles; walkers lie between
 MAX_STD, OF_FILTER = 0.5, 0.5  # of the filter's deviation: its maximum for a share, and its part beside Newey and West's
@@ -81,6 +81,7 @@ class _Evidence:
     difference: Vector6  # of the bias shown from the prior's mean
     variance: Vector6  # of it, without the prior
     stops: tuple[tuple[float, float], ...] = ()  # begin and end (s)
+    odds: float = 0.0  # logarithm, of the prior's unit to others
 
 
 def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], about: Mapping[str, str]) -> Fitness:
@@ -134,8 +135,8 @@ def _trained(model: BiasModel, start: InitialBias, samples: Samples, about: Mapp
         *other_conditions(model, samples),
         *other_unit(model, about),
     ]
-    if not (doubts or confirmed or _same_unit(model, about)) and (doubt := untold_bias(prior.mean, _shown_std(found, prior))):
-        doubts.append(doubt)
+    if not (doubts or confirmed or _same_unit(model, about)):
+        doubts += filter(None, [untold_unit(prior, found.variance, found.odds, _shown_std(found, prior))])
     if doubts:
         return Fitness("doubtful", tuple(doubts))
     agreement = _shown_share(share) if confirmed else _agreement(found, prior, share)
@@ -218,7 +219,8 @@ def _shown(blocks: Sequence[FilteredBlock], prior: BiasPrior) -> _Evidence:
     difference = np.where(shown, (last.bias - prior.mean) / gain, 0.0)
     variance = np.where(shown, 1.0 / np.where(shown, precision, 1.0), np.inf) + prior.walk**2 * blocks[-1].end_s
     surprising = float((found.chi_square > SURPRISING).mean())
-    return _Evidence(float(found.log_likelihood.sum()), surprising, difference, variance, stops_of(blocks))
+    odds = ShownBias.of(last.bias - prior.mean, last.covariance(False), prior.std, AT_REST_STD).odds_of_unit(prior)
+    return _Evidence(float(found.log_likelihood.sum()), surprising, difference, variance, stops_of(blocks), odds)
 
 
 def _not_shown(start: InitialBias, found: _Evidence) -> Iterator[str]:

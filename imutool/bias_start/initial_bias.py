@@ -19,17 +19,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Float64, Vectors
 from imutool.bias.log_binding import without_drift
 from imutool.bias.model import (
-    GAP_S,
-    BiasEstimate,
     BiasModel,
-    Covariances,
     RestBiasEstimator,
     Stream,
     Vector6,
 )
+from imutool.bias.static import ConstantBiasStream
 from imutool.bias_start.bias_tracking import (
     BiasTrajectory,
     Samples,
@@ -38,7 +35,15 @@ from imutool.bias_start.bias_tracking import (
     filter_blocks,
     smooth_blocks,
 )
-from imutool.bias_start.prior_width import USUAL_WALK, BiasPrior, LeastWidth, shown_bias, std_before, supported_std
+from imutool.bias_start.prior_width import (
+    USUAL_WALK,
+    BiasPrior,
+    LeastWidth,
+    of_log,
+    shown_bias,
+    std_before,
+    supported_std,
+)
 from imutool.bias_start.stretches import MAX, StretchClock, measured_rows
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.inertial_filter import FilterSettings
@@ -51,7 +56,6 @@ SESSION_GAP_S = 6 * 3600.0  # a longer pause is another switching-on
 NOT_SWITCHED = 0.5  # probability that a sensor stayed on within these hours
 PRIOR, TRACKED_BY = "prior of the training logs", "gravity in motion and every stop"
 UNKNOWN_BODY = {"speed_m_s": 10.0, "speed_correlation_s": 0.5}  # with 3 m/s cars had twice the error, drones a twelfth less
-STEP_S = 1.0  # of the covariance of a constant rest bias, whose dynamics take minutes
 
 METHODS = ("auto", "stationary", "prior", "truth")
 
@@ -109,56 +113,6 @@ class InitialBias:
         return self.track is not None or self.follows is not None
 
 
-class ConstantBiasStream:
-    """Constant rest bias; its covariance grows by random walk and the model's drift."""
-
-    def __init__(self, model: BiasModel, rest: Vector6, std: Vector6) -> None:
-        self._stream = model.stream(rest)
-        self._P, self._t_s, self._before_s = np.diag(std**2), 0.0, 0.0
-        self._maximum = np.maximum(std, model.prior_std) ** 2
-        self._transition = _transition(model.rest_dynamics() * STEP_S)
-        self._walk = np.diag(model.walk_std**2) * STEP_S
-
-    def estimate(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> BiasEstimate:
-        """Bias at each sample, and the covariance of the rest bias in steps of `STEP_S`."""
-        covariance = np.empty((len(t_s), 6, 6))
-        ends = [*np.flatnonzero(np.diff(t_s, prepend=self._before_s) > GAP_S).tolist(), len(t_s)]
-        first = self._within(t_s, 0, ends[0], covariance)
-        for end in ends[1:]:
-            self._after_gap(float(t_s[first]))
-            first = self._within(t_s, first, end, covariance)
-        self._before_s = float(t_s[-1]) if len(t_s) else self._before_s
-        return BiasEstimate(self._stream(t_s, gyro, accel), covariance)
-
-    def _within(self, t_s: Float64[np.ndarray, " n"], first: int, end: int, covariance: Covariances) -> int:
-        """Covariances from row `first` to `end`, which no gap interrupts."""
-        while first < end:
-            last = min(end, int(np.searchsorted(t_s, self._t_s + STEP_S)))
-            if last > first:
-                covariance[first:last] = self._P
-                first = last
-            if first < end:
-                self._P = self._transition @ self._P @ self._transition.T + self._walk
-                self._t_s += STEP_S
-        return end
-
-    def _after_gap(self, t_s: float) -> None:
-        """Add the random walk of whole steps up to a time, no more than the variance of a run's bias; nothing drifts."""
-        steps = max(0.0, (t_s - self._t_s) // STEP_S)
-        variance = np.diag(self._P)
-        self._P = self._P + np.diag(np.minimum(steps * np.diag(self._walk), np.maximum(self._maximum - variance, 0.0)))
-        self._t_s += steps * STEP_S
-
-
-def _transition(F: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:
-    """Matrix exponential."""
-    if not F.any():
-        return np.eye(6)
-    from scipy.linalg import expm
-
-    return np.asarray(expm(F))
-
-
 def prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
     """Prior bias of a log that begins at a stamp: about the mean of its session, or of all.
 
@@ -192,6 +146,21 @@ def tracked_from_prior(model: BiasModel, first_ns: int | None = None) -> Initial
     std = std_before(start.std, start.minimum)
     how = f"{training_source(model)}, {accuracy(std)}, then {TRACKED_BY}"
     return InitialBias(start.rest, std, how, follows=bias_prior(model, first_ns))
+
+
+def tracked_in_motion(model: BiasModel, imu: Imu) -> InitialBias:
+    """Prior bias, tracked from the first sample on; for a log that does not stop.
+
+    Of another unit's log it is the bias that these samples show, smoothed.
+    """
+    first_ns = int(imu.t_ns[0]) if len(imu) else 0
+    before, samples = bias_prior(model, first_ns), relative_samples(imu)
+    found = smooth_bias(model, [samples], before)
+    track, other = found.track, of_log(before, found.difference, found.variance, AT_REST_STD)
+    if other is before:
+        return tracked_from_prior(model, first_ns)
+    how = f"gravity in motion, as of another unit, {accuracy(track.std[0])}, then {TRACKED_BY}"
+    return InitialBias(track.rest[0], track.std[0], how, track=track, follows=other, hold_s=float(samples[0][-1]))
 
 
 def smoothed_start(model: BiasModel, batches: Iterable[Samples], before: BiasPrior, where: str = "") -> InitialBias:
@@ -270,9 +239,11 @@ def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) 
     than a block.
     """
     found = _smoothed(model, batches, prior)
-    std = supported_std(prior.std, prior.minimum, found.difference, found.variance)
-    kept = np.array_equal(std, prior.std)
-    return found if kept else found._replace(track=_smoothed(model, batches, replace(prior, std=std)).track)
+    used = of_log(prior, found.difference, found.variance, AT_REST_STD)
+    if used is prior:
+        used = replace(prior, std=supported_std(prior.std, prior.minimum, found.difference, found.variance))
+    kept = np.array_equal(used.std, prior.std) and used.mean is prior.mean
+    return found if kept else found._replace(track=_smoothed(model, batches, used).track)
 
 
 def _smoothed(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> SmoothedBias:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from imutool.array_types import Bool, Float64
 from imutool.bias.model import Vector6
-from imutool.cleaning.likelihood import axis_names, signed_permutations
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State
 from imutool.units import COLUMNS
@@ -24,9 +24,10 @@ BIAS_ROWS = np.eye(12)[:6]  # d(bias)/d(error of both biases)
 MIN_SHOWN = 0.2  # precision from the log, of that of the prior, below which the log says nothing about the prior
 SAME_WIDTH = 1e-6  # share of a variance by which a narrower prior differs at least
 SHARES = np.linspace(0.0, 1.0, 25)[:, None]  # of the way from the least width of a prior to the most, in equal ratios
-TURNED = 20.0  # chi-square that turned axes leave at most, and by which they are better
-MAX_LEFT = 0.2  # share of chi-square that turned axes leave; of sensors that were turned up to 0.16, by chance 0.28
-FEW_SESSIONS, MAX_LEFT_OF_FEW = 3, 0.12  # few say little of the next one; TUM-VI's turned sensor, of one session, leaves 0.11
+DEPENDENT = 2.0  # ratio of the shown bias's deviation to the filter's, which takes velocities for independent; a hand circles
+MAX_UNKNOWN = 1e-3  # rad/s, deviation of a bias that may be left unknown: 3 degrees in a minute
+HIDDEN = 3.0  # deviations, below which a bias may as well be none
+TELLS = 20.0  # odds that tell a unit
 CONTRADICTED = (np.inf, 10.8, 13.8, 16.3)  # chi-square of as many differences; a true prior exceeds it once in a thousand logs
 
 
@@ -116,31 +117,6 @@ def shown_bias(
     return (bias - mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)
 
 
-def max_left(sessions: int) -> float:
-    """Share of chi-square that turned axes leave at most, by the known sessions."""
-    return MAX_LEFT_OF_FEW if 1 <= sessions <= FEW_SESSIONS else MAX_LEFT
-
-
-def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, max_left: float, *, confirmed: bool = False) -> list[str]:
-    """Sentence on a log whose bias is clearly that of the training logs in turned axes.
-
-    A correction of scales is the same in axes that are turned by half a turn, so the share of it says nothing about these. If
-    it is `confirmed`, there are no other turns. `max_left` is the share of chi-square that turned axes leave at most: less,
-    where few logs show how much the bias changes by itself.
-    """
-    rotations = signed_permutations()[np.linalg.det(signed_permutations()) > 0.0]  # the identity first
-    if confirmed:
-        rotations = rotations[(np.abs(rotations) == np.eye(3)).all(axis=(1, 2))]
-    turned = (rotations[:, None] @ mean.reshape(2, 3, 1)).reshape(-1, 6)
-    chi_square = (((mean + difference - turned) / std) ** 2).sum(axis=1)
-    best = int(np.argmin(chi_square))
-    if chi_square[best] > min(TURNED, max_left * chi_square[0]) or chi_square[0] - chi_square[best] < TURNED:
-        return []
-    return [
-        f"its bias is that of the training logs if its x, y, z are their {axis_names(rotations[best])}: the axes are turned"
-    ]
-
-
 def other_bias(difference: Vector6, deviations: Vector6, maximum: Vector6) -> Iterator[str]:
     """Sentences on biases that differ from a prior's by more deviations than a maximum."""
     for sensor, unit, columns in (("gyro", "rad/s", COLUMNS["gyro"]), ("accelerometer", "m/s²", COLUMNS["accel"])):
@@ -166,20 +142,71 @@ def contradicted_start(rest: Vector6, std: Vector6, shown: Vector6, shown_std: V
     return sentences, bool((off - np.abs(shown) > TELLING + MAX_DEVIATIONS * total).any())
 
 
-def untold_bias(mean: Vector6, std: Vector6) -> str:
-    """Sentence on a log that agrees with a prior to within `std`, but may be another sensor's.
+class ShownBias(NamedTuple):
+    """Bias minus a prior's mean, in its deviations, along directions that a log shows."""
 
-    A bias that is larger than a switching-on changes tells the sensor, where no bias at all would contradict it. While the log
-    does not show such a bias of the gyro, its small biases tell nothing: most sensors have them.
+    directions: Float64[np.ndarray, "k 6"]
+    difference: Float64[np.ndarray, " k"]
+    variance: Float64[np.ndarray, " k"]
+
+    @classmethod
+    def of(cls, difference: Vector6, after: Float64[np.ndarray, "6 6"], before: Vector6, offset: Vector6) -> ShownBias:
+        """What a filter has found about a prior of deviations `before`; `offset` is the deviation that no filter knows."""
+        precision = np.linalg.inv(after / np.outer(before, before))
+        value, columns = np.linalg.eigh(0.5 * (precision + precision.T) - np.eye(6))
+        value, u = value[value > MIN_SHOWN], columns.T[value > MIN_SHOWN]
+        return cls(u, u @ precision @ (difference / before) / value, DEPENDENT**2 / value + u**2 @ (offset / before) ** 2)
+
+    def odds_of_unit(self, prior: BiasPrior) -> float:
+        """Logarithm of the odds of the bias, of the prior's unit to others of its kind.
+
+        Others have biases about zero, as large as this one's or smaller, for a sensor may be a good one. How much smaller is as
+        unknown as the width of the unit's own prior (`supported_std`).
+        """
+        minimum = prior.std if prior.minimum is None else np.minimum(prior.minimum.std, prior.std)
+        size = np.sqrt(np.repeat((prior.mean**2).reshape(2, 3).mean(axis=1), 3))
+        own = self._likelihood(self.difference, minimum / prior.std, np.ones(6))
+        whole = self.difference + self.directions @ (prior.mean / prior.std)
+        return own - self._likelihood(whole, minimum / prior.std, np.maximum(size, minimum) / prior.std)
+
+    def _likelihood(self, e: Float64[np.ndarray, " k"], minimum: Vector6, maximum: Vector6) -> float:
+        """Log-likelihood of a difference, the mean over widths from the minimum to the maximum."""
+        variance = (minimum ** (1.0 - SHARES) * maximum**SHARES) ** 2 @ (self.directions**2).T + self.variance
+        each = -0.5 * (e**2 / variance + np.log(variance)).sum(axis=1)
+        return float(each.max() + np.log(np.mean(np.exp(each - each.max()))))
+
+
+def untold_unit(prior: BiasPrior, variance: Vector6, odds: float, std: Vector6) -> str:
+    """Sentence on a log that may be another unit's, by what it does not show.
+
+    It does not show a bias of the gyro, or agrees to within a large `std` alone. `variance` is that of the bias that the log
+    shows. This bias tells the unit if it is `TELLS` times as probable for it as for others: of these, at most one in so many is
+    taken for this one.
     """
-    size = np.abs(mean)
-    large = size > MAX_CHANGE
-    axis = int(np.argmax(np.where(large, size, 0.0)[:3]))
-    if large[axis] and not (large & (std < size / MAX_DEVIATIONS)).any():
-        bias = f"the gyro's bias about {'xyz'[axis]}, {mean[axis]:+.2g} rad/s in the training logs"
-        return f"the log neither shows {bias}, nor names its sensor: on another one, it does harm"
+    size = np.abs(prior.mean[:3])
+    hidden = np.where((size > MAX_UNKNOWN) & (size < HIDDEN * DEPENDENT * np.sqrt(variance[:3])), size, 0.0)
+    if hidden.any() and odds < math.log(TELLS):
+        axis = int(np.argmax(hidden))
+        bias = f"the gyro's bias about {'xyz'[axis]}, {prior.mean[axis]:+.2g} rad/s in the training logs"
+        return f"the log neither shows {bias}, nor tells its unit: on another one, it does harm"
     nothing = "the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor"
     return "" if (std < TELLING / 2.0).any() else nothing
+
+
+def of_log(prior: BiasPrior, difference: Vector6, variance: Vector6, offset: Vector6) -> BiasPrior:
+    """Prior for a log, about zero if its gyro's bias is likelier another unit's.
+
+    That bias is also nearer to none than to the training logs'. What the log does not show is about zero then, as wide as the
+    bias that it shows. Else the prior itself.
+    """
+    gyro, mean, std, known = COLUMNS["gyro"], prior.mean.copy(), prior.std.copy(), np.isfinite(variance)
+    bias, off = (each[gyro][known[gyro]] for each in (mean + difference, difference))
+    of_axes = (DEPENDENT**2 * variance + offset**2)[known] / std[known] ** 2
+    shown = ShownBias(np.eye(6)[known], (difference / std)[known], of_axes)
+    if np.linalg.norm(bias) >= np.linalg.norm(off) or shown.odds_of_unit(prior) > 0.0:
+        return prior
+    mean[gyro], std[gyro] = 0.0, np.maximum(std[gyro], np.sqrt(np.mean(bias**2)))
+    return replace(prior, mean=mean, std=std, minimum=None)
 
 
 def supported_std(

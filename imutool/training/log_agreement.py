@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from imutool.array_types import Float64
-from imutool.bias_start.prior_width import MAX_CHANGE, turned_axes
+from imutool.bias.log_binding import turned_axes
+from imutool.bias_start.prior_width import MAX_CHANGE
 from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.windows import HUBER_MEDIANS, huber_weight, rotation_residual

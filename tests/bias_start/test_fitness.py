@@ -340,22 +340,49 @@ def test_a_bias_that_moves_from_stop_to_stop_is_doubtful(untrained: bool, moved:
     assert "from stop to stop" in " ".join(drifts.reasons)
 
 
-@pytest.mark.parametrize(("usual", "is_doubtful"), [(0.001, True), (0.02, False)])
-def test_a_bias_that_a_log_does_not_show_is_doubtful_where_it_may_as_well_be_none(usual: float, is_doubtful: bool) -> None:
-    """A boat that rolls and pitches, and turns about the vertical: gravity shows all but the bias about that."""
+def boat(model_rad_s: list[float], log_rad_s: list[float], std_rad_s: float) -> tuple[BiasModel, Imu]:
+    """Model of a boat that rolls and pitches, and turns about the vertical, and a log: gravity hides the bias about that."""
     rng, t = np.random.default_rng(4), np.arange(0.0, 60.0, 0.01)
     roll, pitch, yaw = 0.05 * np.sin(0.9 * t), 0.04 * np.sin(0.7 * t + 1.0), 0.3 * np.sin(0.2 * t)
     turn = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1))
     rates = (turn[:-1].inv() * turn[1:]).as_rotvec() / 0.01
-    gyro = np.concatenate([rates, rates[-1:]]) + 1e-3 * rng.normal(size=(len(t), 3))
+    gyro = np.concatenate([rates, rates[-1:]]) + 1e-3 * rng.normal(size=(len(t), 3)) + log_rad_s
     accel = turn.inv().apply([0.0, 0.0, GRAVITY_M_S2]) + 0.02 * rng.normal(size=(len(t), 3))
-    statistics = {"prior_mean": np.array([0.0, 0.0, usual, 0.0, 0.0, 0.0]), "prior_std": np.array([7e-3] * 3 + [0.05] * 3)}
-    boat = linear.Model(linear.Config(), 100.0, statistics)
-    boat.card = {"name": "boat", "logs": [{}] * 3}
-    found = judged(boat, Imu((1e9 * t).astype(np.int64), gyro + np.array([0.0, 0.0, usual]), accel))
+    statistics = {"prior_mean": np.array([*model_rad_s, 0.0, 0.0, 0.0]), "prior_std": np.array([std_rad_s] * 3 + [0.05] * 3)}
+    made = linear.Model(linear.Config(), 100.0, statistics)
+    made.card = {"name": "boat", "logs": [{"name": "own"}] * 3}
+    return made, Imu((1e9 * t).astype(np.int64), gyro, accel)
+
+
+@pytest.mark.parametrize(("usual", "is_none"), [(0.001, True), (0.02, False)])
+def test_a_bias_that_a_log_does_not_show_is_doubtful_where_it_may_as_well_be_none(usual: float, is_none: bool) -> None:
+    found = judged(*boat([0.0, 0.0, usual], [0.0, 0.0, usual], 7e-3))
     told = " ".join(found.reasons)
-    assert ("neither stops nor gravity shows the gyro's bias about z" in told) == is_doubtful, told
-    assert found.verdict == ("doubtful" if is_doubtful else "fits"), told
+    assert ("neither stops nor gravity shows the gyro's bias about z" in told) == is_none, told
+    assert found.verdict == "doubtful", told
+
+
+def test_a_boat_whose_bias_another_unit_may_have_as_well_is_doubtful_unless_it_tells_the_unit() -> None:
+    """Its heading goes with the model's bias about the vertical, which nothing in the log refutes."""
+    small, other = [0.003, -0.002, 0.004], [0.0015, -0.003, -0.002]
+    model, imu = boat(small, other, 2.5e-3)
+    found = judged(model, imu)
+    assert found.verdict == "doubtful", found
+    assert "neither shows the gyro's bias about z, +0.004 rad/s in the training logs, nor tells its unit" in found.reasons[0]
+    assert judged(model, imu, {"sequence": "own"}).verdict == "fits"
+    large = [0.03, -0.025, 0.004]
+    assert judged(*boat(large, large, 2.5e-3)).verdict == "fits", "two axes that agree tell the unit"
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_bias_about_the_vertical_is_not_taken_from_a_unit_that_the_other_axes_refute(smooth: bool) -> None:
+    model, imu = boat([0.012, -0.01, 0.006], [-0.003, 0.004, -0.002], 2.5e-3)
+    start = smooth_in_memory(model, imu, "boat") if smooth else auto(model, imu)
+    assert abs(start.rest[2]) < 2e-3, start
+    np.testing.assert_allclose(start.rest[:2], [-0.003, 0.004], atol=1.5e-3)
+    own, imu = boat([0.012, -0.01, 0.006], [0.014, -0.011, 0.006], 2.5e-3)
+    start = smooth_in_memory(own, imu, "boat") if smooth else auto(own, imu)
+    assert start.rest[2] > 4e-3, "its own unit has another turn-on bias"
 
 
 @pytest.mark.parametrize("stops", [True, False])
