@@ -19,12 +19,12 @@ def from_centre(lat: np.ndarray, lon: np.ndarray, up: np.ndarray) -> np.ndarray:
     return np.stack([level * np.cos(lon), level * np.sin(lon), ((B / A) ** 2 * normal + up) * np.sin(lat)], axis=1)
 
 
-@pytest.mark.parametrize(("lat_deg", "lon_deg"), [(47.4, 8.5), (-33.9, 151.2), (0.0, -78.5), (64.1, -21.9)])
+@pytest.mark.parametrize(("lat_deg", "lon_deg"), [(47.4, 8.5), (-33.9, 151.2), (0.0, -78.5), (-16.8, 180.0)])
 def test_metres_are_east_north_and_up_of_the_simulations_first_position(lat_deg: float, lon_deg: float) -> None:
     rng, size = np.random.default_rng(0), 500.0 / 111_000.0  # degrees of some 500 m
     lat, lon = np.radians(lat_deg + size * rng.uniform(-1.0, 1.0, 50)), np.radians(lon_deg + size * rng.uniform(-1.0, 1.0, 50))
     up = 400.0 + rng.uniform(-50.0, 50.0, 50)
-    values = {"latitude": np.degrees(lat), "longitude": np.degrees(lon), "altitude": up}
+    values = {"latitude": np.degrees(lat), "longitude": (np.degrees(lon) + 180.0) % 360.0 - 180.0, "altitude": up}
     side = {name: Fields(np.arange(50), column) for name, column in values.items()}
     found = metres(side, side)
     s, c = np.sin([lat[0], lon[0]]), np.cos([lat[0], lon[0]])
