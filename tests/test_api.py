@@ -305,12 +305,51 @@ ZEROS = np.zeros((2, len(STILL.imu), 3))
         (lambda: imutool.convert("a.mcap", "b.mcap", format="eurok"), "format: .*Did you mean 'euroc'"),
         (lambda: imutool.clean("a.mcap", rules="spike"), "rules: .*Did you mean 'spikes'"),
         (lambda: imutool.clean("a.mcap", skip_rules="spike"), "skip_rules: .*Did you mean 'spikes'"),
+        (lambda: imutool.clean("a.mcap", rules="spikes", skip_rules="spikes"), "rules, skip_rules: spikes is in both lists"),
+        (lambda: imutool.clean("a.mcap", fix=True), "`fix` needs `target`"),
+        (lambda: imutool.clean("a.mcap", init=np.zeros(6)), "`init` needs `target`"),
+        (lambda: imutool.info("a.mcap", max_chunk=0), "max_chunk: 0 bytes; expected 1 or more"),
+        (lambda: imutool.convert("raw", "logs", progress=True), "progress: is of type bool; expected a function"),
+        (lambda: imutool.convert("raw", "logs", mapping=["t"]), "mapping: is of type list; expected text or a path or a dict"),
+        (lambda: imutool.InitialBias(np.full(6, np.nan), np.ones(6), "mine"), r"InitialBias.rest is \[nan, .*expected finite"),
+        (lambda: imutool.InitialBias(np.zeros(6), -np.ones(6), "mine"), r"InitialBias.std is \[-1.0, .*that are not negative"),
     ],
-    ids=range(30),
+    ids=range(38),
 )
 def test_a_value_of_another_kind_is_said(call: Callable[[], object], said: str) -> None:
     with pytest.raises(imutool.ImutoolError, match=said):
         call()
+
+
+UNCHECKED = """
+import numpy as np
+from dataclasses import replace
+import imutool
+
+made = imutool.example_recording(duration_s=1.0)
+rows = np.zeros((len(made.imu), 6))
+for call in (
+    lambda: made.truth.at(made.truth.t_ns[:4].reshape(2, 2)),
+    lambda: imutool.write("a.mcap", replace(made, scalars={"/t": imutool.Scalars([1], [20.0], 3)})),
+    lambda: imutool.write("a.mcap", replace(made, frames={"/cam0": imutool.Frames("png", 1, [(1, b"")])})),
+    lambda: imutool.LiveView("/imu0", print).add(made.imu.gyro, rows, rows),
+):
+    try:
+        call()
+    except imutool.DataError as error:
+        print(error)
+"""
+
+
+def test_a_value_of_another_kind_is_said_where_no_type_is_checked() -> None:
+    """Under the tests jaxtyping would refuse these values first."""
+    done = subprocess.run([sys.executable, "-c", UNCHECKED], check=True, capture_output=True, text=True)
+    assert done.stdout.splitlines() == [
+        "t_ns is int64[2, 2]; expected int64[n].",
+        "flight_1: the unit of /t is of type int; expected text.",
+        "flight_1: the `each` of /cam0 is of type list; expected a function.",
+        "LiveView.add: is of type ndarray; expected samples as an `Imu`.",
+    ]
 
 
 def test_a_log_without_samples_is_not_diagnosed(tmp_path: Path) -> None:

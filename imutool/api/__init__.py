@@ -6,7 +6,7 @@ import functools
 import inspect
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from itertools import chain, count
 from numbers import Integral, Real
@@ -54,6 +54,9 @@ KINDS = {
     "float": _Kind("a number", lambda value: isinstance(value, Real) and not _is_flag(value)),
     "bool": _Kind("True or False", _is_flag),
     "Sequence[str]": _Kind("a list of texts", _are_texts),
+    "Mapping[str, Any]": _Kind("a dictionary", lambda value: isinstance(value, Mapping)),
+    "Progress": _Kind("a function", callable),
+    "NamedProgress": _Kind("a function", callable),
     "None": _Kind("None", lambda value: value is None),
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from imutool.api import Init, checked, init_text
@@ -69,7 +70,7 @@ def clean(
         progress: Callback with bytes done and bytes in all.
 
     Raises:
-        ConfigError: The log cannot be opened, a rule is unknown, or `target` exists.
+        ConfigError: The log cannot be opened, a rule is unknown, an option needs `target`, or `target` exists.
         LogError: No such IMU, or the log is not trusted and `force` is false.
 
     Examples:
@@ -78,25 +79,22 @@ def clean(
         >>> report.surveys[0].verdict
         'good'
     """
-    wanted, imus = chosen(several(rules), several(skip_rules), force, fix), several(imus)
-    check_outputs([OutputFile("target", target, output_conflicts.LOG)], [source, model], overwrite=overwrite)
+    wanted, start = chosen(several(rules), several(skip_rules), force, fix), init_text(init)
     if target is None:
-        return survey_imus(source, imus, wanted)
+        refuse_without_target(model=model, init=start != "auto", smooth=smooth, force=force, fix=fix, overwrite=overwrite)
+        return survey_imus(source, several(imus), wanted)
     from imutool.debiasing import debias
 
-    report = debias(
-        location(source),
-        location(target),
-        model=model,
-        imus=imus,
-        init=init_text(init),
-        smooth=smooth,
-        clean=wanted,
-        force=force,
-        overwrite=overwrite,
-        progress=progress or silent,
-    )
+    check_outputs([OutputFile("target", target, output_conflicts.LOG)], [source, model], overwrite=overwrite)
+    run = partial(debias, location(source), location(target), model=model, imus=several(imus), init=start, smooth=smooth)
+    report = run(clean=wanted, force=force, overwrite=overwrite, progress=progress or silent)
     return CleanReport(tuple(report.surveys.values()), report.losses, dict(report.rewrite.added))
+
+
+def refuse_without_target(**options: object) -> None:
+    """Refuse options of a new log, by name, that are given without one."""
+    if idle := [name for name, given in options.items() if given]:
+        raise ConfigError(f"`{idle[0]}` needs `target`", where="clean", fix="Name the log to be written")
 
 
 def survey_imus(

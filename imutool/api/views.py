@@ -225,8 +225,11 @@ class LiveView:
             std: One standard deviation of `bias`.
 
         Raises:
-            DataError: `bias` or `std` has not one row of six for each sample.
+            DataError: `imu` is no `Imu`, or `bias` or `std` has not one row of six for each sample.
         """
+        given: object = imu
+        if not isinstance(given, Imu):
+            raise DataError(f"is of type {type(given).__name__}", where="LiveView.add", expected="samples as an `Imu`")
         if not np.shape(bias) == np.shape(std) == (len(imu), 6):
             what = f"bias and std of shape {list(np.shape(bias))}, {list(np.shape(std))}"
             raise DataError(what, where="LiveView.add", expected=f"[{len(imu)}, 6], a row for each sample")

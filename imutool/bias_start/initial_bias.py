@@ -86,6 +86,9 @@ class InitialBias:
         for name in ("rest", "std", "noise"):
             if (value := converted(getattr(self, name), f"InitialBias.{name}")).shape != (6,):
                 raise DataError(f"InitialBias.{name} is {value.dtype}{list(value.shape)}", expected="float64[6]")
+            if not (np.isfinite(value).all() if name == "rest" else (value >= 0.0).all()):
+                expected = "finite numbers" if name == "rest" else "numbers that are not negative"
+                raise DataError(f"InitialBias.{name} is {value.tolist()}", expected=expected)
             object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:

@@ -65,7 +65,7 @@ def chosen(only: Iterable[str], without: Iterable[str], force: bool, fix: bool) 
     rules = CleaningSettings(only=tuple(only), without=tuple(without), force=force, fix=fix)
     rules.names()
     if both := set(rules.only) & set(rules.without):
-        raise ConfigError(f"{min(both)} is in both lists", where="rule", fix="Give `rule` or `no_rule`")
+        raise ConfigError(f"{min(both)} is in both lists", where="rules, skip_rules", fix="Leave it out of one of them")
     return rules
 
 

@@ -10,7 +10,7 @@ import typer
 
 from imutool.cli.app import COMMON, HTML, LOG, Common, Imus, Init, MaxChunk, Smooth, Written, app, listing
 from imutool.cli.terminal import out, plain, say, table, tell_losses
-from imutool.errors import LOST, ConfigError
+from imutool.errors import LOST
 from imutool.file_location import to_location
 from imutool.report import UNSET, Report, UnsetType
 
@@ -46,13 +46,11 @@ def clean(
     from imutool.cleaning.rule import chosen
 
     rules = chosen(rule or (), no_rule or (), force, fix)
-    given = {"--model": model, "--init": init != "auto", "--smooth": smooth, "--force": force, "--fix": fix}
-    given["--overwrite"] = common.overwrite and report_to is None and common.json_to is None
-    if target is None and (idle := [name for name, value in given.items() if value]):
-        raise ConfigError(f"{idle[0]} needs OUT", where="clean", fix="Name the log to be written")
     if target is None:
-        from imutool.api.cleaning import survey_imus
+        from imutool.api.cleaning import refuse_without_target, survey_imus
 
+        replaces = common.overwrite and report_to is None and common.json_to is None
+        refuse_without_target(model=model, init=init != "auto", smooth=smooth, force=force, fix=fix, overwrite=replaces)
         with common.progress("Looking through") as tell:
             found = survey_imus(source, imu or (), rules, max_chunk, tell)
         surveys, added, losses = list(found.surveys), found.added, found.losses

@@ -38,7 +38,7 @@ def coverage(topic: str, kind: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: I
     if len(knots) < 2:
         return TruthInfo(topic, len(truth_ns), kind)
     steps = np.diff(knots)
-    limit = max(GAP_FACTOR * float(np.median(steps)), nanoseconds(MIN_GAP_S))  # 4 median periods, 60 ms
+    limit = max(GAP_FACTOR * float(np.median(steps)), nanoseconds(MIN_GAP_S))  # as `Poses.at`
     covered, count, start, end = 0, 0, 2**63 - 1, -(2**63)
     for part in imu_ns:
         after = np.searchsorted(knots, part, side="left")

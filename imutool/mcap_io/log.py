@@ -11,7 +11,7 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from imutool.array_types import Int64, UInt64
-from imutool.errors import DataError, LogError
+from imutool.errors import ConfigError, DataError, LogError
 from imutool.file_location import Location, location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records, schemas
@@ -36,13 +36,15 @@ class Log:
     `reads_topics` is copied or checked as it is: a topic may have two types.
 
     Raises:
-        ConfigError: the file cannot be opened.
+        ConfigError: the file cannot be opened, or `max_chunk` is less than one.
         LogError: empty, not an MCAP log, cut short or damaged.
     """
 
     index: LogIndex
 
     def __init__(self, path: str | Location | Source, *, max_chunk: int | None = None, reads_topics: bool = True) -> None:
+        if max_chunk is not None and max_chunk < 1:
+            raise ConfigError(f"{max_chunk} bytes", where="max_chunk", expected="1 or more")
         keep_buffers()
         self._reads_topics = reads_topics
         self.max_chunk = records.MAX_CHUNK if max_chunk is None else max_chunk

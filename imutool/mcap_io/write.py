@@ -59,8 +59,10 @@ def write(recording: Recording, path: Location, *, compression: str = "zstd", ov
 
     Raises:
         ConfigError: the target exists (without `overwrite`) or cannot be written, or an unknown compression.
-        DataError: two topics of one name, or times ROS 2 cannot store (before 1970, or seconds beyond 32 bits).
+        DataError: two topics of one name, a unit or frames of another kind, or times ROS 2 cannot store (before 1970, or
+            seconds beyond 32 bits).
     """
+    _refuse_other_kinds(recording)
     with LogWriter(path, compression=compression, overwrite=overwrite) as log:
         _write_metadata(log, recording)
         groups = [_imu(log, recording), _poses(log, recording), scalar_series(log, recording.scalars, frame_id="")]
@@ -68,6 +70,16 @@ def write(recording: Recording, path: Location, *, compression: str = "zstd", ov
         streams += [_images(log, topic, frames) for topic, frames in recording.frames.items()]
         for chunk, packing in heapq.merge(*streams, key=lambda item: item[0].start_ns):
             log.chunk(chunk, packing)
+
+
+def _refuse_other_kinds(recording: Recording) -> None:
+    """Refuses units and formats that are no text, and images without a function that gives them (DataError)."""
+    parts: list[tuple[str, object]] = [(f"unit of {topic}", numbers.unit) for topic, numbers in recording.scalars.items()]
+    parts += [(f"format of {topic}", frames.format) for topic, frames in recording.frames.items()]
+    wrong = [(part, value, "text") for part, value in parts if not isinstance(value, str)]
+    wrong += [(f"`each` of {topic}", f.each, "a function") for topic, f in recording.frames.items() if not callable(f.each)]
+    for part, value, expected in wrong:
+        raise DataError(f"the {part} is of type {type(value).__name__}", where=recording.name, expected=expected)
 
 
 def _write_metadata(log: LogWriter, recording: Recording) -> None:

@@ -149,7 +149,7 @@ def converted(value: Any, where: str, *, times: bool = False) -> Shaped[np.ndarr
     if array.dtype == object and all(isinstance(item, Real) for item in array.flat):
         array = np.asarray(array.tolist())
     masked = isinstance(mask := getattr(value, "mask", None), np.ndarray | np.bool_) and bool(mask.any())
-    if not masked and (found := _exactly(array, wanted)) is not None:
+    if not masked and not (times and array.ndim > 1) and (found := _exactly(array, wanted)) is not None:
         return found
     kind = f"{array.dtype}{list(array.shape)}" if isinstance(value, np.ndarray) else f"of type {type(value).__name__}"
     if times and array.dtype.kind == "f":

@@ -23,6 +23,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 from support.digests import digests
+from support.imu_defects import batch_of, late, pick, repeated, with_values, write_log
 from support.loaded import loaded_by_command
 
 from imutool.api.logs import convert, export
@@ -207,6 +208,10 @@ def test_sensor_yaml_says_where_its_noise_is_from(log: Path, tmp_path: Path) -> 
     text = (tmp_path / "measured/mav0/imu0/sensor.yaml").read_text(encoding="utf-8")
     assert "4.2 h at rest" in text
     assert "# gyroscope_random_walk is not known" in text
+    write(replace(whole(), metadata={"imu0/sensor.yaml": {"text": "rate_hz: 1\n"}}), tmp_path / "kept.mcap")
+    export(tmp_path / "kept.mcap", tmp_path / "instead", format="euroc", noise=tmp_path / "imu.toml")
+    given = (tmp_path / "instead/mav0/imu0/sensor.yaml").read_text(encoding="utf-8")
+    assert given == text.replace('"bmi160"', '"unknown"'), "a given noise takes the place of the source's file"
 
 
 def test_a_truth_without_velocity_comes_back_without(tmp_path: Path) -> None:
@@ -253,6 +258,38 @@ def test_a_bias_that_leaves_the_stamps_of_the_poses_late_gives_the_same_folder(
     assert alike_in_parts(tmp_path / "log.mcap", monkeypatch, 6)
 
 
+def test_a_debiased_log_in_parts_gives_the_same_folder(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was subtracted between the last sample of a part and the first of the next is known to the whole alone."""
+    debias(log, tmp_path / "debiased.mcap", model="static", force=True)
+    assert alike_in_parts(tmp_path / "debiased.mcap", monkeypatch, 1)
+
+
+def test_a_clock_that_is_set_back_gives_the_same_folder_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sound = batch_of(whole().imu)
+    write_log(pick(sound, np.roll(np.arange(len(sound.stamp_ns)), 200)), tmp_path / "log.mcap")
+    assert alike_in_parts(tmp_path / "log.mcap", monkeypatch, 0)
+
+
+@pytest.mark.parametrize("defect", ["late", "repeated", "not finite"])
+def test_what_is_wrong_with_samples_is_said_of_the_whole_log(
+    defect: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sound = batch_of(whole().imu)
+    batches = {
+        "late": late(sound, [70, 200], 9),
+        "repeated": repeated(sound, [64, 128], 2),
+        "not finite": with_values(sound, [70, 128], 2, np.nan),
+    }
+    write_log(batches[defect], tmp_path / "log.mcap")
+    said = list[str]()
+    for rows in (log_parts.PART_ROWS, 64):
+        monkeypatch.setattr(log_parts, "PART_ROWS", rows)
+        with pytest.raises(LogError, match="/imu0") as refused:
+            export(tmp_path / "log.mcap", tmp_path / "out", format="euroc")
+        said.append(str(refused.value))
+    assert said[0] == said[1]
+
+
 def test_memory_does_not_grow_with_the_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_parts, "PART_ROWS", 1 << 12)
     peaks = []
@@ -278,6 +315,19 @@ def test_jpeg_keeps_its_ending_and_what_is_no_image_is_refused(tmp_path: Path) -
         export(tmp_path / "x.mcap", tmp_path / "x", format="euroc")
     assert not (tmp_path / "x").exists()
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
+
+
+def test_samples_in_g_and_two_images_of_one_time_are_refused(tmp_path: Path) -> None:
+    """The headers of the tables state units, and an image is named by its time."""
+    recording = whole()
+    imu = Imu(recording.imu.t_ns, recording.imu.gyro, recording.imu.accel / 9.81)
+    write(replace(recording, imu=imu), tmp_path / "g.mcap")
+    twice = Frames("png", 2, lambda: iter([(START_NS, PNG), (START_NS, PNG)]))
+    write(replace(recording, frames={"/cam0/image_raw/compressed": twice}), tmp_path / "twice.mcap")
+    for name, what in (("g", "accel looks like g, not m/s"), ("twice", f"two images have the stamp {START_NS} ns")):
+        with pytest.raises(ImutoolError, match=what):
+            export(tmp_path / f"{name}.mcap", tmp_path / name, format="euroc")
+        assert not (tmp_path / name).exists()
 
 
 def test_images_pass_through_one_at_a_time(tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ NOISE = Noise(
 )
 
 
-def diagnosed(folder: Path, *, arm_x: float = ARM[0], bias_x: float = 0.01) -> Path:
+def diagnosed(folder: Path, *, arm_x: float = ARM[0], bias_x: float = 0.01, noise: Noise = NOISE) -> Path:
     """The folder of a diagnosis: a mount, an arm, digits, a limit and a scale."""
     entries = {
         "lever_arm": {"x": (arm_x, "m"), "y": (ARM[1], "m"), "z": (ARM[2], "m")},
@@ -61,7 +61,7 @@ def diagnosed(folder: Path, *, arm_x: float = ARM[0], bias_x: float = 0.01) -> P
     )
     folder.mkdir(parents=True)
     physics_file.write(PhysicsFile(effect=effects, bias=Bias(gyro=(bias_x, 0.0, -0.02))), folder / "physics.toml")
-    datasheet.write(NOISE, folder / "noise.toml")
+    datasheet.write(noise, folder / "noise.toml")
     return folder
 
 
@@ -173,6 +173,21 @@ def test_a_fleet_gives_means_and_ranges(tmp_path: Path) -> None:
     assert file.bias is not None
     assert file.bias.gyro[0] == pytest.approx(0.01)
     assert datasheet.read(tmp_path / "out" / "noise.toml") == NOISE
+
+
+def test_the_biases_of_a_fleet_scatter_and_its_noise_is_that_of_the_middle_unit(tmp_path: Path) -> None:
+    biases, sizes = (0.0, 0.01, 0.05), (0.03, 0.01, 0.02)
+    for k, (bias_x, size) in enumerate(zip(biases, sizes, strict=True)):
+        noise = msgspec.structs.replace(NOISE, accel_density=(size,) * 3)
+        diagnosed(tmp_path / "fleet" / f"robot_{k}", bias_x=bias_x, noise=noise)
+    export(tmp_path / "fleet", tmp_path / "gazebo", format="gazebo")
+    noise_of = ElementTree.parse(tmp_path / "gazebo" / "imu.sdf").getroot().find("model/link/sensor/imu")
+    assert noise_of is not None
+    spread = float(np.std(biases, ddof=1))
+    assert float(noise_of.findtext("angular_velocity/x/noise/bias_stddev") or "") == pytest.approx(spread)
+    assert float(noise_of.findtext("linear_acceleration/x/noise/stddev") or "") == pytest.approx(0.02 * np.sqrt(RATE_HZ))
+    export(tmp_path / "fleet", tmp_path / "isaac", format="isaac")
+    assert f"n_max={2.0 * spread!r}" in (tmp_path / "isaac" / "imu.py").read_text(encoding="utf-8")
 
 
 def _lines(*f_hz: float) -> tuple[Entry, ...]:

@@ -175,6 +175,16 @@ def test_a_run_that_has_lost_its_crc_and_the_end_of_its_digest_does_not_count(tm
         assert read.done("b") == result("b", messages=7)
 
 
+def test_without_the_line_of_its_run_the_second_note_of_targets_tells_the_settings(tmp_path: Path) -> None:
+    fill(tmp_path, "a")
+    lines = (tmp_path / NAME).read_bytes().splitlines(keepends=True)
+    (tmp_path / NAME).write_bytes(b"".join(line for line in lines if not line.startswith(b'{"line":"run"')))
+    with pytest.raises(ConfigError, match="other settings"):
+        Journal(tmp_path, OTHER, resume=True)
+    with Journal(tmp_path, SETTINGS, resume=True) as journal:
+        assert journal.done("a") == result("a", messages=7)
+
+
 def test_lines_of_an_earlier_version_count(tmp_path: Path) -> None:
     fill(tmp_path, "a")
     (tmp_path / NAME).write_bytes(re.sub(rb',"crc":"[0-9a-f]{8}"', b"", (tmp_path / NAME).read_bytes()))
@@ -189,6 +199,8 @@ def test_results_that_are_there_are_not_begun_anew_without_a_word(tmp_path: Path
         Journal(tmp_path, SETTINGS)
     with pytest.raises(ConfigError, match=r"other settings \(init 'auto', now 'prior'\)"):
         Journal(tmp_path, OTHER, resume=True)
+    with pytest.raises(ConfigError, match=r"other settings \(another content of the model\)"):
+        Journal(tmp_path, msgspec.structs.replace(SETTINGS, model_sha256="2"), resume=True)
     assert (tmp_path / NAME).read_bytes() == before
 
 

@@ -10,8 +10,9 @@ import pytest
 from mcap.writer import Writer
 from support.imu_defects import batch_of, late, pick, repeated, with_values, write_log
 
+from imutool.cleaning.samples import BLOCK, blocks
 from imutool.log_info import clock, imu_samples
-from imutool.log_info.imu_samples import ImuSamples
+from imutool.log_info.imu_samples import ImuSamples, KeptBlocks
 from imutool.log_info.inspection import inspect
 from imutool.log_info.report import Interval
 from imutool.mcap_io.codec import records, schemas
@@ -61,6 +62,20 @@ def test_samples_come_in_order_of_time_each_stamp_once(tmp_path: Path, name: str
     assert len(imu) == len(t_ns)
     for k, (a, b) in enumerate(((0, 11), (4000, 4101), (15_000, len(t_ns)))):
         assert np.array_equal(np.concatenate([part for stretch, part in within if stretch == k]), values[a:b])
+
+
+def test_kept_samples_are_those_of_both_ends_and_too_many_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = batch_of(moving(2 * BLOCK))
+    kept, few = KeptBlocks(), KeptBlocks()
+    for samples in blocks([batch]):
+        kept.add(samples)
+    found = kept.read(int(batch.log_time[7]), int(batch.log_time[BLOCK + 3]))
+    assert found is not None
+    assert np.concatenate([samples.number for samples in found]).tolist() == list(range(7, BLOCK + 4))
+    monkeypatch.setattr(imu_samples, "MAX_ROWS", BLOCK)
+    for samples in blocks([batch]):
+        few.add(samples)
+    assert few.read(None, None) is None
 
 
 def test_missing_samples_are_counted_across_blocks(tmp_path: Path) -> None:

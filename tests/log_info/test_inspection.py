@@ -333,6 +333,11 @@ def test_coverage_by_the_truth_counts_samples_between_near_poses(tmp_path):
     imu = resting(2000)
     known = np.ones(2000, bool)
     known[:200] = known[1000:1200] = False  # starts 1 s late and has a gap of 201 periods
+    early_ns = imu.t_ns[0] - 40_000_000_000 + 5_000_000 * np.r_[:100, 250:400]  # with a gap that is none of the IMU's time
+    for before in (early_ns[:0], early_ns):
+        poses = still_poses(np.concatenate([before, imu.t_ns[known]]))
+        (truth,) = logged(tmp_path, imu, truths={"/ground_truth/pose": poses})["truth"]
+        assert truth["gaps"] == 1 + bool(len(before))
     report = logged(tmp_path, imu, truths={"/ground_truth/pose": still_poses(imu.t_ns[known])})
     (truth,) = report["truth"]
     assert truth["coverage"] == pytest.approx(1600 / 2000)

@@ -48,6 +48,13 @@ def test_the_variance_of_the_white_noise_is_known_and_the_first_block_has_any_nu
         np.testing.assert_allclose(a, b, rtol=1e-9)
 
 
+def test_the_variance_within_short_blocks_is_that_of_their_samples() -> None:
+    x = residual(0.0)
+    found = walk_likelihood(x[:600], np.ones((1, 600)), np.arange(600) // 2, STEPS * 2)
+    assert found is not None
+    assert found.within == pytest.approx(1.0, rel=0.3)  # of 300 differences: three deviations
+
+
 def test_a_walk_is_found_though_slow_effects_took_it_up() -> None:
     t = np.linspace(0.0, 1.0, SAMPLES)
     gained = gains(residual(1e-4), *(t**k for k in range(1, 6)))

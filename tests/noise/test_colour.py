@@ -56,6 +56,17 @@ def test_noise_of_the_expected_signal_itself_is_not_drawn_once_more() -> None:
     assert np.all(drawn.std(axis=0) < 0.3 * std)
 
 
+def test_the_range_of_each_sensor_is_that_of_its_own_noise() -> None:
+    t_s, motion, swelling = _made(np.random.default_rng(5))
+    noise = np.hstack([np.random.default_rng(6).normal(size=(len(t_s), 3)), swelling[:, 3:]])
+    colour = measured([(t_s, motion + noise, motion)], noise.std(axis=0), RATE_HZ)
+    assert colour is not None
+    (low, high), (accel_low, accel_high) = colour.gyro_range, colour.accel_range
+    assert 0.9 < low < 1.0 < high < 1.1  # white noise
+    assert accel_low < 0.5
+    assert accel_high > 1.5
+
+
 def test_a_recording_of_seconds_has_no_colour_and_a_colour_belongs_to_its_rate() -> None:
     t_s, motion, noise = _made(np.random.default_rng(0))
     few = slice(0, int(8.0 * RATE_HZ))

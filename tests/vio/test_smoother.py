@@ -82,6 +82,14 @@ def test_without_a_camera_it_is_dead_reckoning(perfect: Recording, course: VioPr
     assert np.abs(blind.bias).max() < 1e-3
 
 
+@pytest.mark.parametrize("disparity_px", [0.0, -0.5])
+def test_a_track_at_infinity_is_put_far_away(perfect: Recording, course: VioProblem, disparity_px: float) -> None:
+    """Noise makes its disparity zero or less, behind the camera."""
+    dark = [Frame(np.zeros(0, np.int64), np.zeros((0, 3)))] * len(course.frames)
+    far = Frame(np.array([7]), np.array([[400.0, 400.0 - disparity_px, 200.0]]))
+    assert max(errors(run(perfect, course, [*dark[:3], far, *dark[4:]]), course)) < 0.02
+
+
 def test_bias_states_find_a_wrong_bias_and_without_them_it_spoils_the_estimate(perfect: Recording, course: VioProblem) -> None:
     wrong = shifted(perfect.imu)
     on = run(perfect, course, imu=wrong)

@@ -183,7 +183,7 @@ def metres(side: Mapping[str, Fields], origin: Mapping[str, Fields]) -> dict[str
     across = EARTH_M / np.sqrt(1.0 - e2 * sin**2) * np.cos(np.radians(lat0))
     latitude, longitude, altitude = (side[name] for name in ("latitude", "longitude", "altitude"))
     return {
-        "longitude": Fields(longitude.t_ns, np.radians(longitude.values - lon0) * across),
+        "longitude": Fields(longitude.t_ns, np.radians(np.mod(longitude.values - lon0 + 180.0, 360.0) - 180.0) * across),
         "latitude": Fields(latitude.t_ns, np.radians(latitude.values - lat0) * along),
         "altitude": Fields(altitude.t_ns, altitude.values - up0),
     }

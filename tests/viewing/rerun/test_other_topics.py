@@ -177,12 +177,16 @@ def test_of_a_damaged_log_what_lies_before_the_damage_is_shown(data: RunData, re
     assert shown == [image for _, image in large[: len(shown)]]
 
 
-def test_another_clock_in_the_headers_is_not_taken_for_the_imus(data: RunData) -> None:
+def test_another_clock_in_the_headers_is_not_taken_for_the_imus(data: RunData, monkeypatch: pytest.MonkeyPatch) -> None:
     log_ns = np.arange(data.start_ns, data.start_ns + 10 * TENTH, TENTH, dtype=np.int64)
     shifted = np.arange(10, dtype=np.int64) * TENTH  # since boot, say
     np.testing.assert_array_equal(other_topics.elapsed_ns(shifted, log_ns, data), log_ns - data.start_ns)
     np.testing.assert_array_equal(other_topics.elapsed_ns(log_ns + 3, log_ns, data), log_ns + 3 - data.start_ns)
     np.testing.assert_array_equal(other_topics.elapsed_ns(None, log_ns, data), log_ns - data.start_ns)
+    one_shifted = np.append(log_ns[:-1] + 3, shifted[-1])  # no part of a chunk on one clock, the rest on another
+    np.testing.assert_array_equal(other_topics.elapsed_ns(one_shifted, log_ns, data), log_ns - data.start_ns)
+    monkeypatch.setattr(RunData, "log_ns", lambda data, t_ns: t_ns + 5_000_000)  # of a recorder that is late
+    np.testing.assert_array_equal(other_topics.elapsed_ns(None, log_ns, data), log_ns - 5_000_000 - data.start_ns)
 
 
 def test_several_logs_keep_their_topics_apart_and_their_transforms_out(data: RunData, tmp_path: Path) -> None:
