@@ -72,7 +72,7 @@ def test_kept_samples_are_those_of_both_ends_and_too_many_are_not_kept(monkeypat
     found = kept.read(int(batch.log_time[7]), int(batch.log_time[BLOCK + 3]))
     assert found is not None
     assert np.concatenate([samples.number for samples in found]).tolist() == list(range(7, BLOCK + 4))
-    monkeypatch.setattr(imu_samples, "MAX_ROWS", BLOCK)
+    monkeypatch.setattr(imu_samples, "MAX_KEPT_ROWS", BLOCK)
     for samples in blocks([batch]):
         few.add(samples)
     assert few.read(None, None) is None
