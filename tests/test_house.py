@@ -182,6 +182,7 @@ MAX_MODULES, MAX_LINES, MAX_FUNCTION_LINES, MEDIAN_FUNCTION_LINES = 12, 300, 60,
 CATALOGUES = {"imutool.cleaning.rules", "imutool.cli", "imutool.converters", "imutool.sensor.effects"}  # a file is an entry
 
 
+@functools.cache
 def folders() -> dict[str, list[str]]:
     """The modules that lie in each folder, by the folder's dotted name."""
     packages = {name.rpartition(".")[0] for name in everything()} & set(everything())

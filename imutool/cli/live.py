@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -73,8 +73,8 @@ def live(
         raise ConfigError("--print and --json - both go to stdout", where="live", fix="Give --json a file")
     found = load_model(model)
     channel = scale_of(found).channel if found.temperature_parameters() else None
-    samples = open_source(origin, malformed, imu=imu, speed=speed, temperature=channel)
-    with _view(connect, save, common.overwrite) if not no_view else nullcontext() as show:
+    opened = closing(open_source(origin, malformed, imu=imu, speed=speed, temperature=channel))
+    with opened as samples, _view(connect, save, common.overwrite) if not no_view else nullcontext() as show:
         stream = run(samples, found, malformed, show=show, each=_print if to_stdout else None, seconds=seconds, force=force)
     shown = [] if show is None else show.shown
     if malformed.count:

@@ -37,7 +37,7 @@ MAX_WAITING = 10_000  # messages between two looks
 MAX_BYTES = 65_536  # of a message; a sample has some 200
 
 
-Samples = Iterator[Sample | None]  # None: nothing came for a while
+Samples = Generator[Sample | None]  # None: nothing came for a while
 
 
 def open_source(
@@ -52,11 +52,11 @@ def open_source(
         LogError: a log without an IMU, or with several.
     """
     samples = _source(name, malformed, imu, speed, temperature)
-    next(samples)  # it is open: whoever drops the iterator closes it
+    next(samples)  # it is open until it is closed, or nothing refers to it
     return samples
 
 
-def timely(source: Samples, seconds: float | None, malformed: Malformed) -> Iterator[Sample]:
+def timely(source: Iterator[Sample | None], seconds: float | None, malformed: Malformed) -> Iterator[Sample]:
     """Samples until the time is up; warns once of a source without any."""
     began = last = time.perf_counter()
     warned = False

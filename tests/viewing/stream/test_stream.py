@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -24,6 +25,7 @@ from support.report_schema import assert_valid
 
 import imutool as api
 from imutool.bias_start.bias_at_rest import auto
+from imutool.cli.live import live
 from imutool.errors import ConfigError, DataError, ModelError
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.recording import Imu
@@ -289,6 +291,18 @@ def test_a_source_that_nobody_reads_is_closed(logs: Path) -> None:
     assert opened.count(logs / "flight_1.mcap") == 1
     del source
     assert not any(entry.readlink() == logs / "flight_1.mcap" for entry in Path("/proc/self/fd").iterdir() if entry.exists())
+
+
+def test_a_refused_stream_is_closed_while_its_error_is_looked_at(tmp_path: Path) -> None:
+    """From Python 3.13 on the log stayed open until the next collection of garbage."""
+    recording = api.example_recording(duration_s=4.0)
+    huge = replace(recording.imu, accel=np.full_like(recording.imu.accel, 1e30))
+    api.write(tmp_path / "huge.mcap", replace(recording, imu=huge))
+    with pytest.raises(DataError, match="none of the first samples is a measurement") as refused:
+        live(log=str(tmp_path / "huge.mcap"), speed=1e9, no_view=True)
+    assert refused.tb is not None
+    opened = [entry.readlink() for entry in Path("/proc/self/fd").iterdir() if entry.is_symlink()]
+    assert tmp_path / "huge.mcap" not in opened
 
 
 def test_datagrams_are_samples(imu: Imu, monkeypatch: pytest.MonkeyPatch) -> None:
