@@ -58,6 +58,11 @@ class _Linear(NamedTuple):
     rows: list[tuple[int, Int64[np.ndarray, " q"], Float[np.ndarray, "q _"], Float[np.ndarray, " _"] | None]]
     N: Float64[np.ndarray, "p p"]
 
+    @property
+    def acts(self) -> bool:
+        """Whether the candidate changes a row; one that acts only next to others may not, given an earlier fit."""
+        return any(bool(b.any()) or (x is not None and bool(x.any())) for _, _, b, x in self.rows)
+
     def short(self) -> _Linear:
         """The same in half of the memory, to guess scores given other fits."""
         half, rows = np.float32, self.rows
@@ -184,7 +189,8 @@ class Candidates:
         derived = self._derived(base)
         allowed = [effect for effect in candidates if may_act(effect, base.keys)]
         allowed = [effect for effect in allowed if not any(exclude_each_other(effect, other) for other, _ in base.chosen)]
-        self._derive(self.score, [effect for effect in allowed if effect.key not in {**derived, **self.scores}], derived)
+        known = {key for key, linear in derived.items() if all(each.acts for each in linear)} | self.scores.keys()
+        self._derive(self.score, [effect for effect in allowed if effect.key not in known], derived)
         guesses = [(-np.inf if count is None else self._guess(self.score, effect, derived).log_p, effect) for effect in allowed]
         best, enough = list[Scored](), max(count or 0, 1)
         for guess, effect in sorted(guesses, key=lambda entry: entry[0]):

@@ -152,6 +152,15 @@ def test_a_heavy_load_is_no_current() -> None:
     assert abs(mass.value - 2.0) < SURE * mass.std < 0.1
 
 
+def test_a_dead_band_that_acts_only_next_to_a_load_is_found() -> None:
+    """Without the load the needed effort is unlike the command, so that a dead band of any width does nothing."""
+    given = pair(load=1.0)
+    effects = found(replace(given, real=given.real + np.sign(given.real) * [0.0, 1.5]))
+    assert set(effects) == {("payload", "/joints"), ("actuator_dead_band", "effort[1]")}
+    width = effects["actuator_dead_band", "effort[1]"]["width"]
+    assert abs(width.value - 1.5) < SURE * width.std < 0.1
+
+
 def test_friction_of_a_single_joint_has_a_name() -> None:
     """A pendulum, whose findings name no joint among several."""
     (real_ns, state, real), (sim_ns, sim_state, sim) = (pendulum(seed, friction) for seed, friction in ((1, 0.5), (2, 0.0)))
