@@ -1,14 +1,12 @@
-"""Copy a log byte for byte and add topics to it, in one pass with one chunk in memory.
+"""Copy a log byte for byte and add topics to it, in one pass with two chunks in memory.
 
 A chunk without IMU messages is copied from file to file (`target.Target.copy`), and its message indexes say what to enter in
 the summary. A chunk that holds messages of a source IMU, or that its indexes do not describe, is unpacked and checked, once:
 those that were checked before the copy began (`Log.keep`) are only copied. Only the summary is new, and message indexes where
-the source has none or wrong ones. Messages outside chunks keep their bytes and are wrapped into chunks, because a reader that
-goes by chunk indexes would otherwise not find them next to the new ones.
+the source has none or wrong ones. Messages outside chunks are wrapped into chunks, where the new chunk indexes name them.
 
-Where the source states the CRC of its data section, it is checked and the copy states one, for which every byte passes through
-memory (1.3 instead of 1.2 of the CPU time of `cp`, `pass` in `tests/bench/rewrite.py`). Where the source states none, as most
-recorders do, the copy states none.
+Where the source states the CRC of its data section, it is checked and the copy states one: every byte passes through memory.
+Where the source states none, as most recorders do, the copy states none.
 """
 
 from __future__ import annotations
@@ -133,9 +131,8 @@ class _Rewrite:
         self.streams = [self._stream(topics, own) for topics in derived]
         self.imu_channels = set().union(*(stream.sources for stream in self.streams)) if self.streams else set()
         self.passing = PassThrough(self.source, out.target)
-        coming = (item for item in self.index.items if isinstance(item, MessageBlock) and self._must_unpack(item))
-        kept = log.kept or ()  # most of these need not be read again
-        self.reader = ChunkReader(self.source, (block for block in coming if block not in kept), self.index.max_chunk)
+        coming = (block for block in self.index.blocks if self._must_unpack(block) and block not in (log.kept or ()))
+        self.reader = ChunkReader(self.source, coming, self.index.max_chunk)
         self.checked = self.unchecked = 0  # chunks unpacked before or while copying; messages that no CRC covers
         self.new_chunks = set[int]()  # their offsets
 
@@ -223,8 +220,8 @@ class _Rewrite:
 
     def _must_unpack(self, block: MessageBlock) -> bool:
         """Whether a chunk may hold messages of an IMU, or definitions."""
-        known = self.index.definitions_known and block.indexes and self.imu_channels.isdisjoint(block.indexes)
-        return block.compression is not None and not known
+        listed = self.index.definitions_known and block.indexes and self.imu_channels.isdisjoint(block.indexes)
+        return block.compression is not None and not listed
 
     def _wrap_run(self, block: MessageBlock) -> None:
         """Writes messages outside chunks as a chunk."""

@@ -60,9 +60,9 @@ def check_chunk(everything: memoryview, block: MessageBlock, max_chunk: int) -> 
 
 
 class ChunkReader:
-    """Read and check the next chunk in a thread while the caller copies this one; a context manager.
+    """Read and check the next chunk in a thread while the caller copies this one.
 
-    Reading, unpacking and CRC release Python's lock. One chunk ahead is in memory, of at most `AHEAD_BYTES`.
+    A context manager. Reading, unpacking and CRC release Python's lock. One chunk ahead is in memory, of at most `AHEAD_BYTES`.
     """
 
     def __init__(self, source: Source, blocks: Iterable[MessageBlock], max_chunk: int) -> None:
