@@ -283,8 +283,10 @@ def test_ctrl_c_before_a_command_begins(tmp_path: Path) -> None:
 def test_a_second_ctrl_c_that_cuts_the_clean_up_short_does_not_end_in_a_promise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    target = Target(tmp_path / "out.json")  # while something refers to it, only `abandon` removes its file
+
     def interrupted() -> None:
-        with caught(), Target(tmp_path / "out.json") as target:
+        with caught(), target:
             target.write(b"{")
             raise KeyboardInterrupt
 
