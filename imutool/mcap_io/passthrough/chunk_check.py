@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +17,6 @@ from imutool.mcap_io.topics import Topic
 
 NO_ENTRIES = np.zeros((0, 2), np.uint64)
 SMALL = 4096  # bytes of a chunk, packed and unpacked, that is unpacked together with its neighbours
-AHEAD_BYTES = 8 << 20  # of a chunk that is read ahead of the copy
 KEPT_BYTES = 10 << 20  # of messages: the two minutes of a 200 Hz IMU that the check of the fit reads, and all of a small log
 
 Heads = Shaped[np.ndarray, " n"]  # of dtype messages.MESSAGE
@@ -57,41 +54,6 @@ def check_chunk(everything: memoryview, block: MessageBlock, max_chunk: int) -> 
         return CheckedChunk(head, None, False, messages.parse(data, block.offset))
     found, right = indexes.messages(data, block.offset)
     return CheckedChunk(head, indexes, right, found)
-
-
-class ChunkReader:
-    """Read and check the next chunk in a thread while the caller copies this one.
-
-    A context manager. Reading, unpacking and CRC release Python's lock. One chunk ahead is in memory, of at most `AHEAD_BYTES`.
-    """
-
-    def __init__(self, source: Source, blocks: Iterable[MessageBlock], max_chunk: int) -> None:
-        self._source, self._max_chunk = source, max_chunk
-        self._blocks = (block for block in blocks if block.end - block.offset <= AHEAD_BYTES)
-        self._ahead: dict[int, Future[tuple[memoryview, CheckedChunk]]] = {}  # one at most, by its offset
-        self._pool = ThreadPoolExecutor(1, "chunks")
-
-    def read(self, block: MessageBlock) -> tuple[memoryview, CheckedChunk]:
-        """The bytes of a chunk with its message indexes, checked; any order but that of the file is slower.
-
-        Raises:
-            LogError: the chunk is damaged.
-        """
-        begun = self._ahead.pop(block.offset, None)
-        self._ahead = {offset: begun for offset, begun in self._ahead.items() if offset > block.offset}
-        if not self._ahead and (following := next((b for b in self._blocks if b.offset > block.offset), None)):
-            self._ahead[following.offset] = self._pool.submit(self._read, following)
-        return begun.result() if begun else self._read(block)
-
-    def _read(self, block: MessageBlock) -> tuple[memoryview, CheckedChunk]:
-        everything = memoryview(self._source.at(block.offset, block.end - block.offset))
-        return everything, check_chunk(everything, block, self._max_chunk)
-
-    def __enter__(self) -> ChunkReader:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._pool.shutdown()
 
 
 def neighbours(blocks: Iterable[MessageBlock]) -> Iterator[list[MessageBlock]]:
@@ -151,9 +113,6 @@ class KeptChunks:
         self._channels = set[int]().union(*(channels for _, channels in topics.values()))
         self._kept: dict[int, KeptChunk] = {}
         self._room = KEPT_BYTES
-
-    def __contains__(self, block: MessageBlock) -> bool:
-        return block.offset in self._kept
 
     def pop(self, block: MessageBlock, channels: set[int]) -> KeptChunk | None:
         """Hand over a chunk, if it was kept with the messages of these channels and defines nothing."""

@@ -32,9 +32,7 @@ def _turned(x: Vectors, R_bi: Float64[np.ndarray, "3 3"]) -> Vectors:
 
 @lru_cache(maxsize=64)
 def _rotation(*phi: float) -> Float64[np.ndarray, "3 3"]:
-    from scipy.spatial.transform import (
-        Rotation,  # a tenth of a second and more, which a model that has this effect need not wait
-    )
+    from scipy.spatial.transform import Rotation  # takes 0.1 s, which a model that is only loaded need not wait
 
     return np.asarray(Rotation.from_rotvec(phi).as_matrix())
 

@@ -75,33 +75,6 @@ def test_a_chunk_is_unpacked_once_though_it_defines_channels(
         assert len(unpacked) == len(set(unpacked))
 
 
-def test_a_reader_checks_each_chunk_once_and_tells_of_damage_at_its_turn(
-    foreign: Foreign, flight: Messages, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = foreign(flight, "zstd", chunk_size=10_000)
-    with Log(path) as log:
-        blocks = [block for block in log.index.blocks if block.compression is not None]
-    expected = [path.read_bytes()[block.offset : block.end] for block in blocks]
-    raw, damaged = bytearray(path.read_bytes()), blocks[6]
-    raw[damaged.offset + damaged.length // 2] ^= 0xFF
-    path.write_bytes(raw)
-    with (
-        Log(path) as log,
-        chunk_check.ChunkReader(log.index.source, [b for b in blocks if b is not blocks[4]], 1 << 20) as reader,
-    ):
-        unpacked, asked = counted_chunks(monkeypatch), [n for n in range(12) if n != 8]  # 4 is not announced, 8 is not read
-        for n in asked:
-            if blocks[n] is damaged:
-                with pytest.raises(LogError, match=f"byte {damaged.offset}"):
-                    reader.read(blocks[n])
-            else:
-                everything, checked = reader.read(blocks[n])
-                assert everything == expected[n]
-                assert checked.right
-    assert len(unpacked) == len(set(unpacked))
-    assert set(unpacked) >= {blocks[n].offset for n in asked}
-
-
 def test_a_log_that_changes_after_its_chunks_were_kept_is_refused(foreign: Foreign, flight: Messages, tmp_path: Path) -> None:
     source = foreign(flight, "zstd")
     with Log(source) as log:
