@@ -155,7 +155,8 @@ def _untrained(start: InitialBias, samples: Samples) -> Fitness:
         other_start, harmful = [*other_start, *in_motion, STEADY_TURN], harmful or turned
     stops = stops_in(samples)
     doubts = (*other_start, *changed_at_rest(samples, stops, UNTRAINED))
-    agreement = "its bias agrees with the gyro at rest" if stops else "the log has no stop that could contradict its bias"
+    unseen = f"the first {CHECKED_S:.0f} s have no stop that could contradict its bias"
+    agreement = "its bias agrees with the gyro at rest" if stops else unseen
     trained = f"trained models ship for {', '.join(units)}"
     return Fitness("unfit" if harmful else "doubtful" if doubts else "fits", (*(doubts or (agreement,)), trained))
 

@@ -61,7 +61,7 @@ def test_the_sensor_itself_fits(model: BiasModel, recording: Recording) -> None:
     assert judged(model, recording.imu, MADE_FOR).verdict == "fits"
     given = judge(static.Model(), from_numbers("0,0,0,0,0,0"), [], {})
     assert given.verdict == "fits"
-    assert given.reasons[0] == "the log has no stop that could contradict its bias"
+    assert given.reasons[0] == "the first 120 s have no stop that could contradict its bias"
 
 
 @pytest.mark.parametrize("arm_m", [-1.0, 1.0])
