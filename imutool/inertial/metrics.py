@@ -159,7 +159,8 @@ class AbsoluteErrors:
 
 def _turned_deg(estimate: Poses, truth: Poses, turn: Float64[np.ndarray, "1 4"] | None = None) -> Float64[np.ndarray, " n"]:
     """Angles between the orientations of two paths, of which the first may be turned."""
-    q_wxyz, q_true_wxyz = (quaternion.unit(poses.q_wb_wxyz) for poses in (estimate, truth))  # six decimals would count
+    # of six decimals, the lengths would count as angles
+    q_wxyz, q_true_wxyz = (quaternion.unit(poses.q_wb_wxyz) for poses in (estimate, truth))
     turned_wxyz = q_wxyz if turn is None else quaternion.multiply(turn, q_wxyz)
     return np.asarray(np.degrees(quaternion.angle_between(turned_wxyz, q_true_wxyz)))
 

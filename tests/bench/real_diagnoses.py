@@ -174,7 +174,7 @@ def learned(fits: Sequence[Mapping[str, Any]]) -> tuple[PhysicsFile, list[str]]:
     for k, name in enumerate(names):
         values = [Value(*one["values"][name]) for one in fits if name in one["values"]]
         told = consistency([(one.value, one.std) for one in values if one.seen])
-        std = max(float(np.sqrt(covariance[k, k])), told.std)  # an information knows no slow errors of the poses
+        std = max(float(np.sqrt(covariance[k, k])), told.std)  # slow errors of the poses show between logs alone
         if told.count < 0.5 * len(fits) or abs(mean[k]) < SURE * std or abs(mean[k]) > UNSEEN * values[0].plausible:
             left.append(name)
             continue

@@ -11,7 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from os.path import commonprefix
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +96,8 @@ def _without_signals(document: Any, columns: Columns) -> Any:
         group.add(name, values, node["unit"] or "")
     for group in groups.values():
         names = [*group.values][1:]
-        shared = commonprefix([f"{name}_" for name in names]).rpartition("_")[0] or "signals"  # noqa: RUF071  # no paths
+        words = zip(*(name.split("_") for name in names), strict=False)
+        shared = "_".join(each[0] for each in takewhile(lambda each: len({*each}) == 1, words)) or "signals"
         columns.take(shared if shared not in columns.sources else f"{shared}{len(columns.sources)}", group, ", ".join(names))
     return {name: node for name, node in document.items() if name not in found} if found else document
 
