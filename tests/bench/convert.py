@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
+import rewrite
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -50,20 +50,6 @@ def write_bag(path: Path, megabytes: int) -> int:
                 bag.write(camera, t_ns, store.serialize_ros1(image, image.__msgtype__))
                 messages += 1
     return messages
-
-
-def measured(command: list[str]) -> tuple[float, float, float]:
-    """Wall time and CPU time (s) and memory (MB) of a command."""
-    code = (
-        "import json, resource, subprocess, sys, time\n"
-        "start = time.perf_counter()\n"
-        "subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)\n"
-        "used = resource.getrusage(resource.RUSAGE_CHILDREN)\n"
-        "print(time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code, *command], check=True, capture_output=True, text=True)
-    wall, cpu, memory = map(float, done.stdout.split())
-    return wall, cpu, memory
 
 
 def write_table(path: Path, rows: int) -> None:
@@ -102,17 +88,19 @@ def main() -> None:
                 "rosbags-convert": ([rosbags, "--dst-storage", "mcap", "--src", str(source), "--dst"], "robot"),
             }
         print(f"{source.stat().st_size / 1e6:.0f} MB")
-        runs: dict[str, list[tuple[float, float, float]]] = {name: [] for name in commands}
+        runs: dict[str, list[rewrite.Spent]] = {name: [] for name in commands}
         sizes: dict[str, float] = {}
         for number in range(RUNS):
             for name, (command, target) in commands.items():
                 out = Path(folder, f"{number}_{target}")
-                runs[name].append(measured([*command, str(out)]))
+                runs[name].append(rewrite.timed([*command, str(out)]))
                 sizes[name] = sum(path.stat().st_size for path in [out, *out.rglob("*")] if path.is_file()) / 1e6
                 shutil.rmtree(out) if out.is_dir() else out.unlink()
         for name, found in runs.items():
-            wall, cpu, memory = (min(column) for column in zip(*found, strict=True))
-            print(f"{name}: {wall:.1f} s wall, {cpu:.1f} s CPU, {memory:.0f} MB; writes {sizes[name]:.0f} MB")
+            least = rewrite.Spent(*(min(column) for column in zip(*found, strict=True)))
+            print(
+                f"{name}: {least.wall:.1f} s wall, {least.cpu:.1f} s CPU, {least.peak_mb:.0f} MB; writes {sizes[name]:.0f} MB"
+            )
 
 
 if __name__ == "__main__":

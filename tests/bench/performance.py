@@ -32,13 +32,6 @@ MODEL = "euroc-adis16448-hybrid"
 PARTS = ("start", "small", "large", "many", "long", "diagnose", "train")
 TERMINAL = [sys.executable, "-c", "import typer, rich"]
 NUMERIC = [sys.executable, "-c", "import numpy, scipy.signal"]
-# a process of its own, which is small: the memory of the one that starts a command would count
-MEASURED = [
-    sys.executable,
-    "-ISc",
-    "import os, sys; pid = os.posix_spawn(sys.argv[1], sys.argv[1:], os.environ); _, status, used = os.wait4(pid, 0); "
-    "print('', used.ru_maxrss); sys.exit(os.waitstatus_to_exitcode(status))",
-]
 FLIGHT = "import imutool, sys; imutool.write(sys.argv[2], imutool.example_recording(2, duration_s=float(sys.argv[1])))"
 
 
@@ -152,7 +145,7 @@ def long(folder: Path, hours: float) -> Iterator[Row]:
     ]
     yield Row("numpy, scipy.signal", NUMERIC, "numpy, scipy.signal")
     for name, words, outputs in lines:
-        yield Row(name, [*MEASURED, IMUTOOL, *map(str, words)], "numpy, scipy.signal", outputs, once=True)
+        yield Row(name, [IMUTOOL, *map(str, words)], "numpy, scipy.signal", outputs, once=True)
 
 
 def taken(row: Row, rounds: int) -> rewrite.Spent:

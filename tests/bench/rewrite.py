@@ -17,13 +17,11 @@ that Python can do with a check of every byte: read into one buffer, CRC, write.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -164,7 +162,7 @@ def floor(source: Path, target: Path) -> None:
 
 
 def job(name: str, source: Path, target: Path, packing: str) -> None:
-    """One job, in a process of its own; then says its peak memory (which the parent's would hide from getrusage)."""
+    """One job, in a process of its own."""
     if name.startswith("rewrite") or name in ("pass", "crc"):
         check = name.partition(" verify ")[2] or "imu"
         rewrite(source, target, [Constant()] if name.startswith("rewrite") else [], metadata={}, check=check)
@@ -174,8 +172,6 @@ def job(name: str, source: Path, target: Path, packing: str) -> None:
         sha256(source)
     elif name == "floor":
         floor(source, target)
-    status = Path("/proc/self/status").read_text()
-    print(json.dumps(next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM"))))
 
 
 class Spent(NamedTuple):
@@ -190,18 +186,21 @@ class Spent(NamedTuple):
         return Spent(*(a - b for a, b in zip(self, other, strict=True)))
 
 
+# Starts a command from a small process: the peak memory of a new process begins with that of the one that starts it.
+STARTER = """
+import os, sys, time
+began, quiet = time.perf_counter(), [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+_, status, used = os.wait4(os.posix_spawnp(sys.argv[1], sys.argv[1:], os.environ, file_actions=quiet), 0)
+print(used.ru_utime + used.ru_stime, time.perf_counter() - began, used.ru_maxrss / 1e3)
+sys.exit(os.waitstatus_to_exitcode(status))
+"""
+
+
 def timed(line: list[str]) -> Spent:
-    """A command run to its end; peak memory is its own, since the start of a process would count its parent's."""
-    began = time.perf_counter()
-    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=INSTALLED) as process:
-        assert process.stdout is not None
-        said = process.stdout.read().split()
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-    wall = time.perf_counter() - began
-    assert process.returncode == 0, line
-    peak = int(said[-1]) / 1e3 if said and said[-1].isdigit() else usage.ru_maxrss / 1e3
-    return Spent(usage.ru_utime + usage.ru_stime, wall, peak)
+    """A command run to its end."""
+    started = [sys.executable, "-ISc", STARTER, *line]
+    done = subprocess.run(started, check=True, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=INSTALLED, text=True)
+    return Spent(*map(float, done.stdout.split()))
 
 
 def race(names: list[str], source: Path, packing: str, rounds: int) -> dict[str, Spent]:
