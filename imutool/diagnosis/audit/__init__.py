@@ -77,11 +77,18 @@ def audit(
     check_poses(simulated, world=False)  # of a wrong world the faults say it, and what to do
     recording, real_mount = (None, AT_BODY) if real is None else read_simulation(real, imu=imu, simulated=False)
     sheet = datasheet.read(noise)
+    expected = _expected(recording, sheet)
     try:
-        faults, unknown_lines, motion_left = _faults(simulated, recording, sheet, (mount, real_mount))
+        faults, unknown_lines, motion_left = _faults(simulated, recording, expected, (mount, real_mount))
     except DataError as error:
         raise error.at(sim) from error
     not_tested = dict(_not_tested(recording, sheet))
+    varying = [sensor for sensor in SENSORS if expected and all(each.varies(sensor) for each in expected)]
+    if varying and not any(fault.fault == "noise_density" for fault in faults):
+        of = " and ".join(varying)
+        not_tested["noise_density"] = (
+            f"the noise of the recording's {of} varies, as vibration does; a smaller one needs a data sheet"
+        )
     if not simulated.truth.has_positions:
         not_tested |= dict.fromkeys(BY_POSITIONS, "the poses have no positions, which the accelerometer needs")
     if unknown_lines and not any(fault.fault == "step_lines" for fault in faults):
@@ -99,11 +106,17 @@ def simulator_faults(sim: Recording, real: Recording | None, sheet: datasheet.No
     Raises:
         DataError: it has no poses that can be differentiated.
     """
-    return _faults(sim, real, sheet, (AT_BODY, AT_BODY))[0]
+    return _faults(sim, real, _expected(real, sheet), (AT_BODY, AT_BODY))[0]
+
+
+def _expected(real: Recording | None, sheet: datasheet.Noise) -> list[Expected]:
+    """Noise by a data sheet and by a recording."""
+    by_sheet = [Expected.of_sheet(sheet)] if _has_noise(sheet) else []
+    return by_sheet + ([] if real is None else [Expected.of_recording(real.imu)])
 
 
 def _faults(
-    sim: Recording, real: Recording | None, sheet: datasheet.Noise, mounts: tuple[Mount, Mount]
+    sim: Recording, real: Recording | None, expected: list[Expected], mounts: tuple[Mount, Mount]
 ) -> tuple[list[FaultFound], list[SpectralLine], dict[str, float]]:
     """Faults, spectral lines whose cause the poses do not show, and large shares of the motion that nothing explains."""
     if not sim.truths:
@@ -112,8 +125,6 @@ def _faults(
     fit = kinematic_fit(moved)
     samples, rate_hz = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1), 1.0 / sim.imu.period_s
     by_motion += motion_faults(moved, fit, max_filter_delays(sim, fit))
-    expected = [Expected.of_sheet(sheet)] if _has_noise(sheet) else []
-    expected += [] if real is None else [Expected.of_recording(real.imu)]
     motion_left = unexplained(moved, fit, by_motion)
     if not sim.truth.has_positions:  # zeros stand for them: of the accelerometer they show nothing
         known = (f for f in by_motion if f.fault == "wrong_unit" or (f.signal != "accel" and f.fault not in BY_POSITIONS))

@@ -35,7 +35,7 @@ CONSEQUENCES = {
     "bandwidth_absent": ("noise_density", "noise_per_sample"),
 }
 MIN_LSB = 0.3  # of the noise: finer digits leave no trace
-SEGMENT, SHORT = 1024, (32, 16)  # samples
+SEGMENT, CALM, SHORT = 1024, 128, (32, 16)  # samples
 QUARTILE = 0.674  # of a normal distribution, in deviations
 REPEATED = 0.08  # of the samples
 ONE_DIGIT = 1.5  # LSB
@@ -46,8 +46,12 @@ WALK_SHARES, WALKS = np.geomspace(0.03, 1.0, 8), 2.0  # of the expected walk; lo
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Expected noise by column; of a recording also its rate, samples and digits."""
+    """Expected noise by column; of a recording also its rate, samples and digits.
 
+    `minimum` is the least density that is the sensor's: zero where the noise of a recording varies, as vibration does.
+    """
+
+    minimum: Float64[np.ndarray, "6"]
     density: Float64[np.ndarray, "6"]
     walk: Float64[np.ndarray, "6"]
     rate_hz: float | None = None
@@ -60,15 +64,21 @@ class Expected:
         density, walk = (
             np.concatenate([noise.values(f"{sensor}_{kind}") for sensor in SENSORS]) for kind in ("density", "walk")
         )
-        return cls(density, walk)
+        return cls(density, density, walk)
 
     @classmethod
     def of_recording(cls, imu: Imu) -> Expected:
         """Density of a recording's samples; how far its bias walks is not known."""
         samples = np.concatenate([imu.gyro, imu.accel], axis=1)
         lsb = np.array([grid(column) for column in samples.T])
-        density = fast_noise(samples, 1.0 / imu.period_s, lsb) * np.sqrt(imu.period_s)
-        return cls(density, np.full(6, np.nan), 1.0 / imu.period_s, samples, lsb)
+        noise = fast_noise(samples, 1.0 / imu.period_s, lsb)
+        varies = (lsb < noise) & (noise > ALIKE * _calmest(samples))
+        minimum, density = (np.sqrt(imu.period_s) * each for each in (np.where(varies, 0.0, noise), noise))
+        return cls(minimum, density, np.full(6, np.nan), 1.0 / imu.period_s, samples, lsb)
+
+    def varies(self, sensor: Sensor) -> bool:
+        """Whether a sensor's noise may be smaller than that of the recording, which varies."""
+        return not np.median(self.minimum[COLUMNS[sensor]]) > 0.0
 
     def filters(self, sensor: Sensor) -> bool:
         """Whether the noise of a recording shows a filter; that of a data sheet is white."""
@@ -79,10 +89,10 @@ class Expected:
 
     def sample(self, sensor: Sensor, rate_hz: float) -> tuple[float, float]:
         """Least and most noise of a sample at a rate; digits add to the noise of a recording."""
-        part = COLUMNS[sensor]
-        density, lsb = float(np.nanmedian(self.density[part])), float(np.median(self.lsb[part]))
-        minimum = _without_digits(density * np.sqrt(self.rate_hz or rate_hz), lsb) / np.sqrt(self.rate_hz or rate_hz)
-        return minimum * np.sqrt(rate_hz), density * np.sqrt(rate_hz)
+        own_hz, part = self.rate_hz or rate_hz, COLUMNS[sensor]
+        least, most = (float(np.nanmedian(each[part])) for each in (self.minimum, self.density))
+        minimum = _without_digits(least * np.sqrt(own_hz), float(np.median(self.lsb[part]))) / np.sqrt(own_hz)
+        return minimum * np.sqrt(rate_hz), most * np.sqrt(rate_hz)
 
 
 def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float, lsb: Column | float = 0.0) -> Column:
@@ -108,15 +118,27 @@ def _between_lines(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Column:
 
 
 def _between_impacts(x: Float64[np.ndarray, "n k"], size: int) -> Column:
-    """Noise by the mean of the frequencies, in segments that end before the next foot strikes.
+    """Noise by the calm quarter of segments that end before the next foot strikes."""
+    levels, shape = _levels(x, size)
+    return np.asarray(np.sqrt(np.quantile(levels, 0.25, axis=-1) / gamma.ppf(0.25, shape)))
 
-    Their powers are gamma distributed: neighbours of a Hann window share 4/9 of it, those next to them 1/36.
+
+def _calmest(x: Float64[np.ndarray, "n k"]) -> Column:
+    """Noise by the calmest segment of all, as the least of so many draws; where the noise varies, this is at most a rest."""
+    levels, shape = _levels(x, CALM)
+    return np.asarray(np.sqrt(levels.min(axis=-1) / gamma.ppf(1.0 / (1 + levels.shape[-1]), shape)))
+
+
+def _levels(x: Float64[np.ndarray, "n k"], size: int) -> tuple[Float64[np.ndarray, "k segments"], float]:
+    """Powers of a sample's noise at high frequency, a segment each, as shares of a gamma distribution of some shape.
+
+    They are means over frequencies: neighbours of a Hann window share 4/9 of it, those next to them 1/36.
     """
     f, _, power = spectrogram(x, 1.0, window="hann", nperseg=min(size, len(x)), axis=0)
     levels = power[(f > 0.25) & (f < 0.48)]
     n = len(levels)
     shape = n**2 / (n + 2.0 * (n - 1) * 4.0 / 9.0 + 2.0 * (n - 2) / 36.0)
-    return np.asarray(np.sqrt(np.quantile(levels.mean(axis=0), 0.25, axis=-1) / gamma.ppf(0.25, shape) * shape / 2.0))
+    return levels.mean(axis=0) * shape / 2.0, shape
 
 
 def noise_faults(

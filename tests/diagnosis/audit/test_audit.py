@@ -134,7 +134,7 @@ def test_a_bias_that_walks_less_than_the_data_sheet_says_does_walk(share: float,
     white = own * rng.normal(size=(6000, 6))
     drift = share * walk / np.sqrt(rate_hz) * np.cumsum(rng.normal(size=white.shape), axis=0)
     imu = Imu((np.arange(6000) * 1e7).astype(np.int64), white[:, :3] + drift[:, :3], white[:, 3:] + drift[:, 3:])
-    faults, _ = noise_faults(imu, white + drift, [Expected(np.full(6, density), np.full(6, walk))])
+    faults, _ = noise_faults(imu, white + drift, [Expected(np.full(6, density), np.full(6, density), np.full(6, walk))])
     assert {fault.fault for fault in faults} == ({"bias_never_walks"} if accused else set())
 
 

@@ -25,6 +25,7 @@ from imutool.diagnosis.result import Estimate
 from imutool.mcap_io.write import write
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu
+from imutool.units import SENSORS
 
 bench = benchmark("audit")
 DURATION_S = 16.0
@@ -72,12 +73,36 @@ def test_a_noise_that_contradicts_sheet_and_recording_is_one_fault() -> None:
     sim, real = np.array([1.0, 3.0])[:, None, None] * np.random.default_rng(3).normal(size=(2, 6000, 6))
     t_ns = (np.arange(6000) * 1e7).astype(np.int64)
     references = [
-        Expected(np.full(6, 0.2), np.full(6, np.nan)),
+        Expected(np.full(6, 0.2), np.full(6, 0.2), np.full(6, np.nan)),
         Expected.of_recording(Imu(t_ns, real[:, :3].copy(), real[:, 3:].copy())),
     ]
     faults, _ = noise_faults(Imu(t_ns, sim[:, :3].copy(), sim[:, 3:].copy()), sim, references)
     assert [(fault.fault, fault.signal) for fault in faults] == [("noise_density", "gyro"), ("noise_density", "accel")]
     assert [fault.parameters["expected"].value for fault in faults] == pytest.approx([3.0, 3.0], rel=0.05)
+
+
+@pytest.mark.parametrize(("own", "vibration", "accused"), [(0.3, 1.0, False), (0.3, 0.0, True), (2.0, 1.0, True)])
+def test_a_recording_that_vibrates_in_flight_refutes_no_smaller_noise(own: float, vibration: float, accused: bool) -> None:
+    """Its calmest second shows at most the sensor's noise; a noise larger than in flight is refuted all the same."""
+    rng, t_ns = np.random.default_rng(3), (np.arange(8000) * 5e6).astype(np.int64)
+    flies = np.arange(8000) > 600
+    level = np.where(flies, 1.0, 1.0 - 0.6 * vibration)[:, None]  # motors idle at first
+    sim, real = own * rng.normal(size=(8000, 6)), level * rng.normal(size=(8000, 6))
+    expected = Expected.of_recording(Imu(t_ns, real[:, :3].copy(), real[:, 3:].copy()))
+    faults, _ = noise_faults(Imu(t_ns, sim[:, :3].copy(), sim[:, 3:].copy()), sim, [expected])
+    assert {fault.fault for fault in faults} == ({"noise_density"} if accused else set())
+    assert [expected.varies(sensor) for sensor in SENSORS] == [vibration > 0.0] * 2
+
+
+def test_an_audit_says_that_a_vibrating_recording_leaves_the_noise_open(tmp_path: Path) -> None:
+    sim, _, _ = bench.made("null", 5, DURATION_S)
+    flies = (np.arange(len(sim.imu)) > 600)[:, None]
+    shaking = 0.05 * flies * np.random.default_rng(1).normal(size=(len(sim.imu), 3))
+    write(sim, tmp_path / "sim.mcap")
+    write(replace(sim, imu=replace(sim.imu, gyro=sim.imu.gyro + shaking)), tmp_path / "real.mcap")
+    report = audit(tmp_path / "sim.mcap", tmp_path / "real.mcap")
+    assert "noise_density" not in report.tested
+    assert "gyro varies" in report.not_tested["noise_density"]
 
 
 def test_a_frame_is_told_by_what_the_poses_follow() -> None:
