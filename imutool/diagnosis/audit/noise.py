@@ -90,9 +90,9 @@ class Expected:
     def sample(self, sensor: Sensor, rate_hz: float) -> tuple[float, float]:
         """Least and most noise of a sample at a rate; digits add to the noise of a recording."""
         own_hz, part = self.rate_hz or rate_hz, COLUMNS[sensor]
-        least, most = (float(np.nanmedian(each[part])) for each in (self.minimum, self.density))
-        minimum = _without_digits(least * np.sqrt(own_hz), float(np.median(self.lsb[part]))) / np.sqrt(own_hz)
-        return minimum * np.sqrt(rate_hz), most * np.sqrt(rate_hz)
+        lower, upper = (float(np.nanmedian(each[part])) for each in (self.minimum, self.density))
+        minimum = _without_digits(lower * np.sqrt(own_hz), float(np.median(self.lsb[part]))) / np.sqrt(own_hz)
+        return minimum * np.sqrt(rate_hz), upper * np.sqrt(rate_hz)
 
 
 def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float, lsb: Column | float = 0.0) -> Column:
