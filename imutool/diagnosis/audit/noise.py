@@ -77,8 +77,9 @@ class Expected:
         return cls(minimum, density, np.full(6, np.nan), 1.0 / imu.period_s, samples, lsb)
 
     def varies(self, sensor: Sensor) -> bool:
-        """Whether a sensor's noise may be smaller than that of the recording, which varies."""
-        return not np.median(self.minimum[COLUMNS[sensor]]) > 0.0
+        """Whether a sensor's noise may be smaller than that of its recording, which varies."""
+        part = COLUMNS[sensor]
+        return bool(np.median(self.minimum[part]) < np.median(self.density[part]))
 
     def filters(self, sensor: Sensor) -> bool:
         """Whether the noise of a recording shows a filter; that of a data sheet is white."""
@@ -124,7 +125,7 @@ def _between_impacts(x: Float64[np.ndarray, "n k"], size: int) -> Column:
 
 
 def _calmest(x: Float64[np.ndarray, "n k"]) -> Column:
-    """Noise by the calmest segment of all, as the least of so many draws; where the noise varies, this is at most a rest."""
+    """Noise by the calmest of all segments: of a noise that does not vary, the least of so many draws."""
     levels, shape = _levels(x, CALM)
     return np.asarray(np.sqrt(levels.min(axis=-1) / gamma.ppf(1.0 / (1 + levels.shape[-1]), shape)))
 
